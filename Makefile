@@ -1,0 +1,45 @@
+# `make up` runs the main job, `make test` passes the tests; both set up what they need on a bare machine.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+SET ?=
+export PYOPENGL_PLATFORM ?= egl
+export PYGLET_HEADLESS ?= 1
+
+.PHONY: help setup system up test lint fast bench clean
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: system $(STAMP)  ## virtual environment and system libraries
+
+system:
+	@PYTHON=$(PYTHON) ./scripts/system-libraries
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; try: make PYTHON=python3.11")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+up: setup  ## the main job: show a tray, disturb it, get it back (SET="world.seed=3" changes settings)
+	$(BIN)/runner up graph.yaml $(addprefix --set ,$(SET))
+
+lint: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+test: lint  ## format, lint, strict types, import layers and every test: what CI runs
+	$(BIN)/pytest
+
+fast: setup  ## the fast tests only
+	$(BIN)/pytest -m 'not slow'
+
+bench: setup  ## speed of the kernel
+	$(BIN)/python -m benchmarks.kernel
+
+clean:
+	rm -rf .venv build .pytest_cache .ruff_cache

@@ -1,0 +1,1 @@
+"""Runs a graph of stages as processes: transport, recording, replay, supervision and views. Knows nothing of robots."""

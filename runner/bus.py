@@ -1,0 +1,192 @@
+"""The transport: a Zenoh session on loopback, its keys, and who is present.
+
+=========================================  ====================================================================
+``RUN/m/STAGE/PORT``                       every message once (Envelope): for recorder and views
+``RUN/d/STAGE/REPLICA/PORT``               the same bytes, delivered to one consumer's input port
+``RUN/j/STAGE``                            journal (Step); tells publishers that what it consumed is done with
+``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
+``RUN/l/STAGE``                            log lines (LogLine)
+``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers
+``RUN/flush``                              query answered by the recorder once it has everything sent before
+=========================================  ====================================================================
+
+A message may be published on its ``m`` key twice, with equal bytes, when its publisher crashed before the step
+was journalled or its part was handed to another replica: readers tell by the id.
+"""
+
+import json
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import zenoh
+
+A = TypeVar("A")
+
+BLOCK_FOR_US = 600_000_000
+"""How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
+FLUSH_SECONDS = 1.0
+RECORDER = "recorder"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Process:
+    """One process of the graph; each restart is another incarnation."""
+
+    stage: str
+    replica: int
+    incarnation: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """What arrived on a key."""
+
+    key: str
+    payload: bytes
+    sent_ns: int
+    """Monotonic clock of this machine when it was sent; 0 where the sender did not say."""
+    arrived_ns: int
+
+
+class Bus:
+    """One process' connection to the others of its run."""
+
+    def __init__(self, run: str, *, listen: str = "tcp/127.0.0.1:0", connect: str | None = None):
+        self._run = run
+        self._session = zenoh.open(_config(listen, connect))
+        self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    def publish(self, path: str, payload: bytes) -> None:
+        """Sends without loss: a full link blocks. ``path`` is the key without the run."""
+        publisher = self._publishers.get(path)
+        if publisher is None:
+            publisher = self._session.declare_publisher(
+                f"{self._run}/{path}",
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+            self._publishers[path] = publisher
+        publisher.put(payload, attachment=struct.pack("<q", time.monotonic_ns()))
+
+    def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
+        """Calls back, on another thread and in order, for everything sent to ``path`` (``*`` and ``**`` allowed)."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr).removeprefix(f"{self._run}/")
+            callback(Packet(key, sample.payload.to_bytes(), _sent_ns(sample), time.monotonic_ns()))
+
+        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", guarded(receive)))
+
+    def announce(self, process: Process) -> None:
+        """Declares this process present, until it closes or dies."""
+        key = f"{self._run}/present/{process.stage}/{process.replica}/{process.incarnation}"
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, callback: Callable[[Process, bool], None]) -> None:
+        """Calls back for every process that is or becomes present (True) and that goes (False)."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            stage, replica, incarnation = str(sample.key_expr).split("/")[-3:]
+            present = sample.kind == zenoh.SampleKind.PUT
+            callback(Process(stage, int(replica), int(incarnation)), present)
+
+        subscriber = self._session.liveliness().declare_subscriber(
+            f"{self._run}/present/*/*/*", guarded(receive), history=True
+        )
+        self._declared.append(subscriber)
+
+    def answer_flush(self) -> None:
+        """Lets the others wait for the recorder: its answer follows everything they sent to it."""
+        key = f"{self._run}/flush"
+
+        def answer(query: zenoh.Query) -> None:
+            query.reply(key, b"")
+
+        self._declared.append(self._session.declare_queryable(key, guarded(answer)))
+
+    def flush(self) -> bool:
+        """Waits until the recorder has received everything sent before; False where it does not answer in time."""
+        replies = self._session.get(f"{self._run}/flush", timeout=FLUSH_SECONDS)
+        return any(reply.ok is not None for reply in replies)
+
+    def close(self) -> None:
+        """Withdraws everything declared and closes the session."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._session.close()
+
+
+class Presence:
+    """Which processes are there, for the ready barrier."""
+
+    def __init__(self):
+        self._present: set[tuple[str, int]] = set()
+        self._changed = threading.Condition()
+
+    def update(self, process: Process, present: bool) -> None:
+        """Takes note of a process that came or went."""
+        with self._changed:
+            change = self._present.add if present else self._present.discard
+            change((process.stage, process.replica))
+            self._changed.notify_all()
+
+    def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
+        """Blocks until all are present; False when ``until`` became true first."""
+        wanted = set(expected)
+        with self._changed:
+            while not wanted <= self._present:
+                if until():
+                    return False
+                self._changed.wait(0.1)
+        return True
+
+
+def guarded(callback: Callable[[A], None]) -> Callable[[A], None]:
+    """Zenoh swallows what a callback raises; this ends the process with the traceback instead."""
+
+    def call(argument: A) -> None:
+        try:
+            callback(argument)
+        except Exception:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+
+    return call
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _config(listen: str, connect: str | None) -> zenoh.Config:
+    settings = {
+        "mode": "peer",
+        "listen/endpoints": [listen],
+        "connect/endpoints": [connect] if connect else [],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _sent_ns(sample: zenoh.Sample) -> int:
+    data = sample.attachment.to_bytes() if sample.attachment is not None else b""
+    return struct.unpack("<q", data)[0] if len(data) == 8 else 0

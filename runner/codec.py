@@ -1,0 +1,324 @@
+"""What goes over the wire and into recordings: msgpack maps, arrays with a checked type and shape, never pickle."""
+
+import math
+import re
+from collections.abc import Callable, Iterable
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+
+from runner.contract import Level, Message, Spec
+
+M = TypeVar("M", bound=Message)
+R = TypeVar("R", bound=msgspec.Struct)
+
+Outcome = Literal["done", "stopped", "failed"]
+"""How a step ended: only ``done`` acknowledges what it consumed."""
+MAX_BYTES = 256 * 2**20
+"""Largest payload that is decoded."""
+MAX_DIMENSIONS = 8
+DTYPES = {
+    name: np.dtype(name)
+    for name in (
+        *("bool", "int8", "int16", "int32", "int64"),
+        *("uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"),
+    )
+}
+"""Element types an array may have, little-endian on the wire."""
+
+
+class CodecError(Exception):
+    """A payload or message that breaks its type: ``type`` and ``field`` say where, ``reason`` why."""
+
+    def __init__(self, type_name: str, field: str, reason: str):
+        self.type = type_name
+        self.field = field
+        self.reason = reason
+        super().__init__(f"{type_name}{'.' if field else ''}{field}: {reason}")
+
+
+MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#\d+$")]
+
+
+class Envelope(msgspec.Struct, frozen=True):
+    """One message as it travels and is recorded: a msgpack map with the message itself under ``body``."""
+
+    id: MessageId
+    """``stage.port#sequence``."""
+    lineage: MessageId
+    """Id of the message at the root of everything this one hangs on."""
+    time_ns: Annotated[int, msgspec.Meta(ge=0)]
+    """Logical time in nanoseconds."""
+    type: str
+    """Class name of the message."""
+    version: int
+    causes: tuple[str, ...]
+    """Ids that the step which emitted this message had consumed."""
+    body: msgspec.Raw
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One journalled step of one stage: what it consumed and emitted, in which order, and how long it took."""
+
+    stage: str
+    replica: int
+    incarnation: int
+    """0 for the first process of this replica, one more after each restart."""
+    number: int
+    """Counts the steps of one process from 0."""
+    handler: str
+    consumed: tuple[tuple[str, str], ...]
+    """(port, message id) in the order of the handler's parameters; a gather's parts by index."""
+    emitted: tuple[str, ...]
+    """Ids in the order of emission."""
+    time_ns: int
+    """Logical time of the step in nanoseconds."""
+    waited_ns: int
+    """From the arrival of the last input to the start of the handler."""
+    travelled_ns: int
+    """From the publication of the last input to its arrival."""
+    computed_ns: int
+    """Time inside the handler."""
+    outcome: Outcome = "done"
+    error: str = ""
+
+
+class Receipt(msgspec.Struct, frozen=True):
+    """What a consumer says of one message (port, id) as it arrives, before it is worked on."""
+
+    port: str
+    id: str
+    consumed: bool = False
+    """True for one that arrived again after it had been consumed."""
+
+
+class LogLine(msgspec.Struct, frozen=True):
+    """One line a stage (or the supervisor) shows to people."""
+
+    stage: str
+    replica: int
+    level: Level
+    text: str
+    time_ns: int
+    """Wall clock, nanoseconds since the epoch."""
+
+
+# ---------------------------------------------------------------------------------------------- arrays
+
+
+def _to_wire(value: Any) -> Any:
+    """Arrays become ``[dtype, shape, bytes]``, numpy scalars plain numbers."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if not isinstance(value, np.ndarray):
+        raise ValueError(f"{type(value).__name__} cannot be encoded")
+    if value.dtype not in DTYPES.values():
+        raise ValueError(f"an array of {value.dtype} cannot be encoded; valid: {', '.join(DTYPES)}")
+    return [value.dtype.name, value.shape, value.tobytes()]
+
+
+def _from_wire(kind: type, value: Any) -> Any:
+    """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
+    if get_origin(kind) is not np.ndarray:
+        raise ValueError(f"{kind} cannot be decoded")
+    match value:
+        case [str() as name, list() as shape, bytes() as data]:
+            return _array(name, cast("list[Any]", shape), data)
+        case _:
+            raise ValueError("expected an array as [dtype, shape, bytes]")
+
+
+def _array(name: str, shape: list[Any], data: bytes) -> np.ndarray:
+    dtype = DTYPES.get(name)
+    if dtype is None:
+        raise ValueError(f"element type {name[:20]!r} is not one of {', '.join(DTYPES)}")
+    if len(shape) > MAX_DIMENSIONS or any(type(extent) is not int or extent < 0 for extent in shape):
+        raise ValueError(f"shape {str(shape)[:60]} is not a list of at most {MAX_DIMENSIONS} extents")
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {name}")
+    if dtype == np.bool_ and data.strip(b"\x00\x01"):
+        raise ValueError("a bool is neither 0 nor 1")
+    return np.ndarray(shape, dtype, buffer=data)
+
+
+def _check_array(array: np.ndarray, spec: Spec, place: str) -> None:
+    """Raises ValueError unless the array is what its field declares."""
+    if array.dtype.name != spec.dtype:
+        raise ValueError(f"expected {spec.dtype}, got {array.dtype.name} - at `{place}`")
+    if not _fits(array.shape, spec.shape):
+        raise ValueError(f"expected shape {_shape(spec.shape)}, got {_shape(array.shape)} - at `{place}`")
+    if spec.finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"NaN or infinity in {np.count_nonzero(~np.isfinite(array))} elements - at `{place}`")
+
+
+def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
+    if len(shape) != len(pattern):
+        return False
+    named: dict[int | str, int] = {}
+    return all(
+        extent == (named.setdefault(want, extent) if isinstance(want, str) else want)
+        for extent, want in zip(shape, pattern, strict=True)
+    )
+
+
+def _shape(extents: Iterable[int | str]) -> str:
+    return f"({', '.join(str(extent) for extent in extents)})"
+
+
+# ---------------------------------------------------------------------------------------------- checks
+
+Check = Callable[[Any, str], None]
+"""Checks the arrays inside one value; the second argument is its place within the message."""
+
+
+@cache
+def _struct_checks(kind: type[msgspec.Struct]) -> tuple[tuple[str, Check], ...]:
+    """The fields of a struct that may hold arrays, each with its check."""
+    hints = get_type_hints(kind, include_extras=True)
+    checks = ((name, _check_of(hints[name])) for name in kind.__struct_fields__)
+    return tuple((name, check) for name, check in checks if check is not None)
+
+
+def _check_of(annotation: Any) -> Check | None:
+    """The check for values of one annotation, or None where they hold no arrays."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        spec = next((extra for extra in arguments[1:] if isinstance(extra, Spec)), None)
+        return _check_of(arguments[0]) if spec is None else lambda value, place: _check_array(value, spec, place)
+    if origin is np.ndarray or annotation is np.ndarray:
+        raise TypeError("an array field needs its Spec: Annotated[NDArray[...], Spec(dtype, shape)]")
+    if origin in (Union, UnionType):
+        return _check_union(arguments)
+    if origin in (tuple, list):
+        return _check_items(_check_of(arguments[0]))
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+        return _check_struct
+    return None
+
+
+def _check_struct(value: Any, place: str) -> None:
+    for name, check in _struct_checks(type(value)):
+        check(getattr(value, name), f"{place}.{name}")
+
+
+def _check_union(members: tuple[Any, ...]) -> Check | None:
+    checks = [check for check in map(_check_of, members) if check is not None]
+    if not checks:
+        return None
+
+    def check_present(value: Any, place: str) -> None:
+        if value is not None:
+            checks[0](value, place)
+
+    return check_present
+
+
+def _check_items(check: Check | None) -> Check | None:
+    if check is None:
+        return None
+
+    def check_each(values: Any, place: str) -> None:
+        for index, value in enumerate(values):
+            check(value, f"{place}[{index}]")
+
+    return check_each
+
+
+# ---------------------------------------------------------------------------------------------- encode, decode
+
+
+@cache
+def _encoder() -> msgspec.msgpack.Encoder:
+    return msgspec.msgpack.Encoder(enc_hook=_to_wire)
+
+
+@cache
+def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(kind, dec_hook=_from_wire)
+
+
+def encode(message: Message) -> bytes:
+    """The message's bytes; raises CodecError where a field is not what its class declares."""
+    kind = type(message)
+    try:
+        body = _encoder().encode(message)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise _codec_error(kind.__name__, error) from None
+    # Reading it back is a full check, made where the blame lies: at the publisher.
+    decode(kind, body)
+    return body
+
+
+def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
+    """Reads one message of a known class; raises CodecError and nothing else, whatever the bytes."""
+    message = _decode(kind, body)
+    try:
+        _check_struct(message, "")
+    except ValueError as error:
+        raise _codec_error(kind.__name__, error) from None
+    return message
+
+
+def pack(record: Envelope | Step | Receipt | LogLine) -> bytes:
+    """A record's bytes, on the wire and in a recording alike."""
+    return _encoder().encode(record)
+
+
+def unpack(kind: type[R], payload: bytes) -> R:
+    """Reads an Envelope, Step, Receipt or LogLine; raises CodecError and nothing else, whatever the bytes."""
+    return _decode(kind, payload)
+
+
+def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
+    """Wraps a message for its journey; raises CodecError where the message breaks its class."""
+    kind = type(message)
+    body = msgspec.Raw(encode(message))
+    return Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, body)
+
+
+def open_envelope(kind: type[M], sealed: Envelope) -> M:
+    """The message inside, which must be of the given class."""
+    if sealed.type != kind.__name__:
+        raise CodecError("Envelope", "type", f"expected {kind.__name__}, got {sealed.type[:60]!r}")
+    return decode(kind, sealed.body)
+
+
+def _decode(kind: type[R], payload: bytes | msgspec.Raw) -> R:
+    size = memoryview(payload).nbytes
+    if size > MAX_BYTES:
+        raise CodecError(kind.__name__, "", f"{size} bytes are more than the limit of {MAX_BYTES}")
+    try:
+        return _decoder(kind).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
+        raise _codec_error(kind.__name__, error) from None
+
+
+def _codec_error(type_name: str, error: Exception) -> CodecError:
+    """Splits the place off an error text of the form ``reason - at `$.field```."""
+    reason, _, place = str(error).partition(" - at `")
+    return CodecError(type_name, re.sub(r"^\$?\.?|`$", "", place), reason)
+
+
+# ---------------------------------------------------------------------------------------------- schemas
+
+
+def json_schema(kind: type[Message]) -> dict[str, Any]:
+    """JSON Schema of the map that carries one message type: the envelope with its body."""
+    _, definitions = msgspec.json.schema_components(
+        [kind, Envelope], schema_hook=_array_schema, ref_template="#/$defs/{name}"
+    )
+    body = definitions.pop(kind.__name__)
+    schema = definitions.pop("Envelope")
+    schema["title"], schema["properties"]["body"] = kind.__name__, body
+    return {**schema, "$defs": definitions} if definitions else schema
+
+
+def _array_schema(kind: type) -> dict[str, Any]:
+    if not issubclass(kind, np.ndarray):
+        raise NotImplementedError
+    extents = {"type": "array", "items": {"type": "integer", "minimum": 0}, "maxItems": MAX_DIMENSIONS}
+    data = {"type": "string", "contentEncoding": "binary"}
+    return {"title": "array", "type": "array", "prefixItems": [{"enum": list(DTYPES)}, extents, data]}

@@ -1,0 +1,92 @@
+"""Compares two decoded messages field by field, bit by bit, and says where and by how much they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+SHOWN = 60
+"""Characters of a value that are shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One field that differs. ``field`` is its path, for example ``objects[2].T_camera_object[0, 3]``."""
+
+    field: str
+    recorded: str
+    replayed: str
+    extent: str = ""
+    """For arrays: how many elements differ, and by how much at most."""
+
+    def __str__(self) -> str:
+        extent = f" ({self.extent})" if self.extent else ""
+        return f"{self.field}: recorded {self.recorded}, replayed {self.replayed}{extent}"
+
+
+def differences(recorded: Any, replayed: Any, field: str = "") -> Iterator[Difference]:
+    """Every field that differs, in the order of declaration. Floats are compared bit by bit: NaN equals NaN."""
+    if type(recorded) is not type(replayed):
+        yield Difference(field, _show(recorded), _show(replayed), "types differ")
+    elif isinstance(recorded, msgspec.Struct):
+        for name in recorded.__struct_fields__:
+            yield from differences(getattr(recorded, name), getattr(replayed, name), f"{field}.{name}".lstrip("."))
+    elif isinstance(recorded, np.ndarray):
+        yield from _array_difference(cast("NDArray[Any]", recorded), cast("NDArray[Any]", replayed), field)
+    elif isinstance(recorded, dict):
+        yield from _mapping_differences(cast("dict[Any, Any]", recorded), cast("dict[Any, Any]", replayed), field)
+    elif isinstance(recorded, list | tuple):
+        yield from _sequence_differences(cast("Sequence[Any]", recorded), cast("Sequence[Any]", replayed), field)
+    elif repr(recorded) != repr(replayed):
+        yield Difference(field, _show(recorded), _show(replayed))
+
+
+def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str) -> Iterator[Difference]:
+    if recorded.keys() != replayed.keys():
+        yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ")
+    for key in filter(replayed.__contains__, recorded):
+        yield from differences(recorded[key], replayed[key], f"{field}[{key!r}]")
+
+
+def _sequence_differences(recorded: Sequence[Any], replayed: Sequence[Any], field: str) -> Iterator[Difference]:
+    if len(recorded) != len(replayed):
+        yield Difference(field, f"{len(recorded)} items", f"{len(replayed)} items", "lengths differ")
+    for index, pair in enumerate(zip(recorded, replayed, strict=False)):
+        yield from differences(*pair, f"{field}[{index}]")
+
+
+def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str) -> Iterator[Difference]:
+    if recorded.dtype != replayed.dtype or recorded.shape != replayed.shape:
+        yield Difference(field, _kind(recorded), _kind(replayed), "element types or shapes differ")
+        return
+    unequal = _bits(recorded) != _bits(replayed)
+    if not unequal.any():
+        return
+    first = tuple(int(extent) for extent in np.argwhere(unequal)[0])
+    extent = f"{np.count_nonzero(unequal)} of {unequal.size} elements differ, by {_largest(recorded, replayed)} at most"
+    place = f"{field}[{', '.join(map(str, first))}]"
+    yield Difference(place, _show(recorded[first].item()), _show(replayed[first].item()), extent)
+
+
+def _bits(array: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(array).view(f"u{array.dtype.itemsize}").reshape(array.shape)
+
+
+def _largest(recorded: NDArray[Any], replayed: NDArray[Any]) -> str:
+    with np.errstate(all="ignore"):
+        gaps = np.abs(recorded.astype(np.float64) - replayed.astype(np.float64))
+    return f"{np.nanmax(gaps, initial=0.0):.3g}"
+
+
+def _kind(array: NDArray[Any]) -> str:
+    return f"{array.dtype.name} {array.shape}"
+
+
+def _show(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."

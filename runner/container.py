@@ -1,0 +1,214 @@
+"""Reads the records of an MCAP file in order or by offset, also where it is torn, damaged or still growing."""
+
+from __future__ import annotations
+
+import fcntl
+import struct
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Protocol, cast
+
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+
+from runner.contract import Refused
+
+MAX_RECORD = 2**30
+"""Bytes; a longer record is taken for a damaged length."""
+POLL_SECONDS = 0.05
+
+_BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
+"""What the MCAP reader and its decompressors raise on bytes that make no sense."""
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A place in the file that does not hold what was written there."""
+
+    offset: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"byte {self.offset}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One recorded payload and its topic."""
+
+    topic: str
+    schema: str
+    """Name of the type."""
+    log_time_ns: int
+    """When the recorder received it, nanoseconds since the epoch."""
+    data: bytes
+    offset: int
+    """Of the chunk or record that holds it, for :meth:`Container.entries_at`."""
+
+
+class Source(Protocol):
+    """What a container is read from: a file, or a :class:`Growing` one."""
+
+    def read(self, size: int, /) -> bytes:
+        """The next ``size`` bytes, fewer only at the end."""
+        ...
+
+    def tell(self) -> int:
+        """Position of the next byte."""
+        ...
+
+
+class Container:
+    """The payloads and metadata of one MCAP stream."""
+
+    def __init__(self, stream: Source, name: str) -> None:
+        self.damage: list[Damage] = []
+        self.torn = True
+        """True until the end is found where the writer put it."""
+        self.unknown = 0
+        """Payloads whose topic stood in a part of the file that is damaged."""
+        self._stream = stream
+        self._name = name
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, str] = {0: ""}
+
+    def __iter__(self) -> Iterator[Entry | Metadata]:
+        """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all."""
+        records = _records(self._stream)
+        while True:
+            offset = self._stream.tell()
+            try:
+                record = next(records)
+            except StopIteration:
+                self.torn = False
+                return
+            except _BROKEN as error:
+                self._refuse_foreign(offset, error)
+                self.damage.append(Damage(offset, _reason(error)))
+                return
+            yield from self._entries(record, offset)
+
+    def read_again(self, file: IO[bytes]) -> Iterator[Entry | Metadata]:
+        """Everything once more, now that the topics are known from the file's end too."""
+        file.seek(0)
+        self.damage.clear()
+        self._stream, self.torn, self.unknown = file, True, 0
+        return iter(self)
+
+    def entries_at(self, file: IO[bytes], offset: int) -> list[Entry]:
+        """The entries of one chunk that iterating has passed, read again from the same file."""
+        file.seek(offset)
+        record = next(_records(file, skip_magic=True))
+        return [entry for entry in self._entries(record, offset) if isinstance(entry, Entry)]
+
+    def _refuse_foreign(self, offset: int, error: Exception) -> None:
+        if offset == 0 and self._stream.tell() <= 8:
+            what = "not an MCAP file" if isinstance(error, InvalidMagic) else "empty or cut off in its first bytes"
+            raise Refused(f"{self._name}: {what}") from None
+
+    def _entries(self, record: McapRecord, offset: int) -> Iterator[Entry | Metadata]:
+        for inner in self._opened(record, offset) if isinstance(record, Chunk) else (record,):
+            match inner:
+                case Channel():
+                    self._channels[inner.id] = inner
+                case Schema():
+                    self._schemas[inner.id] = inner.name
+                case McapMessage(channel_id=id) if id not in self._channels:
+                    self.unknown += 1
+                case McapMessage():
+                    channel = self._channels[inner.channel_id]
+                    schema = self._schemas.get(channel.schema_id, "")
+                    yield Entry(channel.topic, schema, inner.log_time, inner.data, offset)
+                case Metadata():
+                    yield inner
+                case _:
+                    pass
+
+    def _opened(self, chunk: Chunk, offset: int) -> Iterable[McapRecord]:
+        try:
+            return breakup_chunk(chunk, validate_crc=True)
+        except CRCValidationError:
+            self._note(offset, "the chunk's checksum does not match its content")
+        except _BROKEN as error:
+            self._note(offset, f"the chunk cannot be opened: {_reason(error)}")
+            return ()
+        try:
+            return breakup_chunk(chunk)
+        except _BROKEN as error:
+            self._note(offset, f"the chunk cannot be read: {_reason(error)}")
+            return ()
+
+    def _note(self, offset: int, reason: str) -> None:
+        damage = Damage(offset, reason)
+        if damage not in self.damage:
+            self.damage.append(damage)
+
+
+def _records(stream: Source, *, skip_magic: bool = False) -> Iterator[McapRecord]:
+    source = cast("IO[bytes]", stream)
+    return StreamReader(source, skip_magic=skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD).records
+
+
+def _reason(error: Exception) -> str:
+    text = str(error).splitlines()[0] if str(error) else ""
+    return text or {"EndOfFile": "the file ends inside a record"}.get(type(error).__name__, type(error).__name__)
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Opens a recording for reading; raises Refused naming the recordings beside it where that fails."""
+    try:
+        return path.open("rb")
+    except IsADirectoryError:
+        raise Refused(f"{path}: is a directory; {_beside(path)}") from None
+    except FileNotFoundError:
+        raise Refused(f"{path}: no such file; {_beside(path.parent)}") from None
+    except OSError as error:
+        raise Refused(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _beside(folder: Path) -> str:
+    found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
+    return f"recordings in {folder}: {', '.join(path.name for path in found[:8]) or 'none'}"
+
+
+class Growing:
+    """A file that its writer may still append to: reading waits for the bytes until the writer has let go of it."""
+
+    def __init__(self, file: IO[bytes], stopped: Callable[[], bool] = lambda: False) -> None:
+        self._file = file
+        self._stopped = stopped
+
+    def read(self, size: int, /) -> bytes:
+        """``size`` bytes, fewer only at the end."""
+        parts = [self._file.read(size)]
+        while (lacking := size - sum(map(len, parts))) > 0:
+            ended = self._stopped() or not is_being_written(self._file)
+            parts.append(self._file.read(lacking))
+            if ended and not parts[-1]:
+                break
+            if not parts[-1]:
+                time.sleep(POLL_SECONDS)
+        return b"".join(parts)
+
+    def tell(self) -> int:
+        """Position of the next byte."""
+        return self._file.tell()
+
+
+def hold(file: IO[bytes]) -> None:
+    """Marks a file as being written until it is closed, however its process ends."""
+    fcntl.flock(file, fcntl.LOCK_EX)
+
+
+def is_being_written(file: IO[bytes]) -> bool:
+    """True while a process holds the file, see :func:`hold`."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    fcntl.flock(file, fcntl.LOCK_UN)
+    return False

@@ -1,0 +1,128 @@
+"""The contract between a stage and its runner: typed handlers in, typed messages out.
+
+A stage is a class whose ``on_*`` methods are handlers. The runner reads ports and message types from
+their annotations:
+
+* each parameter annotated with a :class:`Message` type is an input port, named like the parameter;
+* several message parameters are a **join by lineage**: the handler runs once every port has a message
+  that hangs on the same root, whatever the order of arrival;
+* a parameter ``list[M]`` (``M`` a :class:`Part`) is a **gather**: the handler runs once all ``count`` parts
+  of a lineage are there, sorted by ``index``;
+* each port belongs to one handler; a join that holds one :class:`Part` runs once for each part of its lineage;
+* a handler without message parameters (``on_start``) runs once, when every stage of the graph is ready;
+* every :class:`Message` type in the return annotation is an output port, named in snake case
+  (``SceneEstimate`` -> ``scene_estimate``). A handler returns one message, ``None``, or an iterator of messages;
+* a parameter annotated :class:`Context` receives the step's context.
+
+Only stages marked ``device`` touch the outside (sensors, simulators, files, wall clock). A device may also
+define ``source(self, ctx) -> Iterator[Message]``, which is advanced between inputs. Replay re-executes every
+other stage and substitutes what devices emitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal, Protocol
+
+import msgspec
+import numpy as np
+
+Level = Literal["debug", "info", "warning", "error"]
+
+
+class Struct(msgspec.Struct, frozen=True, kw_only=True):
+    """A record inside a message. Fields are append-only: new ones have defaults."""
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """A value that crosses a process boundary. Fields are append-only: new ones have defaults."""
+
+    version: ClassVar[int] = 1
+    starts_lineage: ClassVar[bool] = False
+    """True where everything downstream hangs on this message's own id rather than on its cause's."""
+
+
+class Part(Message, frozen=True, kw_only=True):
+    """One of ``count`` messages that fan out from one step and are gathered again, ordered by ``index``.
+
+    Replicated stages share parts between replicas and receive every other message in each replica.
+    """
+
+    index: int
+    count: int
+
+
+class Finished(Message, frozen=True, kw_only=True):
+    """Ends the graph. ``code`` becomes the exit status (0 success), ``reason`` the last line printed."""
+
+    code: int
+    reason: str
+
+
+class Restarted(Message, frozen=True, kw_only=True):
+    """Emitted by the supervisor, as ``supervisor.restarted``, when it replaces a crashed process."""
+
+    stage: str
+    replica: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """What an array field must be; checked when a message is encoded and when it is decoded.
+
+    ``shape`` holds a number where the extent is fixed and a name where it is free; equal names within
+    one array must agree. ``finite`` refuses NaN and infinity.
+    """
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    finite: bool = True
+
+
+class Refused(Exception):
+    """Bad input or configuration from outside: one line that names value, place and valid choices.
+
+    The runner prints it without a traceback and does not restart the stage.
+    """
+
+
+class Context(Protocol):
+    """What a stage may know of the step that runs."""
+
+    @property
+    def time_ns(self) -> int:
+        """Logical time of the step, in nanoseconds: the newest logical time of what it consumed.
+
+        The wall clock where it consumed nothing, and for devices.
+        """
+        ...
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Random numbers seeded from (graph seed, stage, id of the driving message) and nothing else."""
+        ...
+
+    @property
+    def directory(self) -> Path:
+        """Folder beside the recording for files that devices write; it exists."""
+        ...
+
+    def log(self, text: str, *, level: Level = "info") -> None:
+        """Shows one line on the terminal while the graph runs and records it."""
+        ...
+
+
+class Stage:
+    """Base of every stage. A nested frozen dataclass ``Config`` holds its settings and validates itself.
+
+    ``__init__(self, config: Config)`` does all heavy set-up (models, kernels) before the graph is ready;
+    handlers then take as long as their algorithm takes and no longer.
+    """
+
+    device: ClassVar[bool] = False
+    """True where the stage touches the outside: replay substitutes its recorded messages."""
+
+    def close(self) -> None:
+        """Releases what ``__init__`` took. Called once, on every orderly shutdown."""

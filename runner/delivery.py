@@ -1,0 +1,212 @@
+"""The publisher's side of every edge: keeps what is not acknowledged, sends it again, shares parts, holds back."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from runner.bus import Process
+from runner.codec import Envelope
+from runner.graph import Route
+
+PREFETCH = 2
+"""Parts a replica holds at a time: the one it works on and the next, so that it never waits for a delivery."""
+POLL_SECONDS = 0.1
+PATIENCE_SECONDS = 30.0
+"""A publisher that is held back for longer says so."""
+
+Send = Callable[[str, bytes], None]
+"""Publishes bytes on a path of the bus."""
+Warn = Callable[[str], None]
+
+
+class Stopped(Exception):
+    """The graph ends while a publisher waits for room."""
+
+
+@dataclass(slots=True)
+class _Entry:
+    """A message on its way to one consumer."""
+
+    id: str
+    lineage: str
+    payload: bytes
+    replica: int | None = None
+    """Who has been given this part."""
+    received: bool = False
+    """Whether it is in the consumer's memory, and survives this process."""
+
+
+class Outgoing:
+    """One edge, seen from its publisher."""
+
+    def __init__(self, route: Route, send: Send):
+        self.route = route
+        self._send = send
+        self._live: set[int] = set()
+        self._pending: dict[str, _Entry] = {}
+        self._acknowledged: deque[_Entry] = deque(maxlen=route.queue)
+        """The newest of what a restarted process may need again."""
+
+    def has_room(self, lineage: str) -> bool:
+        """Whether one more message may be accepted: a queue is counted in lineages, so that no join can starve."""
+        if self.route.policy == "latest":
+            return True
+        lineages = {entry.lineage for entry in self._pending.values()}
+        return lineage in lineages or len(lineages) < self.route.queue
+
+    def holds_alone(self, message_id: str) -> bool:
+        """Whether a message would be lost with this process."""
+        entry = self._pending.get(message_id)
+        return entry is not None and not entry.received and self.route.policy == "block"
+
+    def received(self, message_id: str) -> None:
+        """Takes note that a message has arrived."""
+        if message_id in self._pending:
+            self._pending[message_id].received = True
+
+    def oldest(self) -> str:
+        """Id of the message that has waited longest."""
+        return next(iter(self._pending), "")
+
+    def accept(self, entry: _Entry) -> None:
+        """Takes a message over and sends it as far as there is somebody to send it to."""
+        if self.route.policy == "latest":
+            self._pending.clear()
+        self._pending[entry.id] = entry
+        if self.route.shared:
+            self._deal()
+        else:
+            for replica in sorted(self._live):
+                self._deliver(entry, replica)
+
+    def acknowledge(self, message_id: str) -> None:
+        """Lets go of a message that has been consumed."""
+        entry = self._pending.pop(message_id, None)
+        if entry is not None and self.route.kept:
+            self._acknowledged.append(entry)
+        if self.route.shared:
+            self._deal()
+
+    def appeared(self, replica: int) -> None:
+        """Sends a new process what it has missed, oldest first."""
+        self._live.add(replica)
+        if self.route.shared:
+            self._take_back(replica)
+            self._deal()
+        else:
+            for entry in (*self._acknowledged, *self._pending.values()):
+                self._deliver(entry, replica)
+
+    def vanished(self, replica: int) -> None:
+        """Hands the parts of a dead replica to the others."""
+        self._live.discard(replica)
+        if self.route.shared:
+            self._take_back(replica)
+            self._deal()
+        elif not self._live:
+            for entry in self._pending.values():
+                entry.received = False
+
+    def _take_back(self, replica: int) -> None:
+        for entry in self._pending.values():
+            if entry.replica == replica:
+                entry.replica, entry.received = None, False
+
+    def _deal(self) -> None:
+        """Gives waiting parts, in order, to the replicas that hold fewest."""
+        held = dict.fromkeys(sorted(self._live), 0)
+        for entry in self._pending.values():
+            if entry.replica in held:
+                held[entry.replica] += 1
+        for entry in self._pending.values():
+            if entry.replica is None and held and min(held.values()) < PREFETCH:
+                entry.replica = min(held, key=lambda replica: held[replica])
+                held[entry.replica] += 1
+                self._deliver(entry, entry.replica)
+
+    def _deliver(self, entry: _Entry, replica: int) -> None:
+        self._send(f"d/{self.route.consumer}/{replica}/{self.route.input}", entry.payload)
+
+
+class Delivery:
+    """All edges that leave one process. Its methods may be called from any thread."""
+
+    def __init__(self, routes: Iterable[Route], send: Send, warn: Warn, stopping: Callable[[], bool]):
+        """``stopping`` is asked again and again while a publisher waits."""
+        self._edges = [Outgoing(route, send) for route in routes]
+        self._warn = warn
+        self._held_back: deque[tuple[tuple[str, ...], Callable[[], None]]] = deque()
+        self._changed = threading.Condition()
+        self._stopping = stopping
+        self._closed = False
+
+    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
+        """Hands a message to every consumer of a port; blocks while one's queue is full. Raises Stopped."""
+        for edge in self._edges:
+            if edge.route.output == port:
+                with self._changed:
+                    self._wait_for_room(edge, envelope.lineage)
+                    edge.accept(_Entry(envelope.id, envelope.lineage, payload))
+
+    def after_arrival(self, message_ids: tuple[str, ...], action: Callable[[], None]) -> None:
+        """Acts, in the order of these calls, once messages have arrived wherever they go.
+
+        A step is journalled only then: were this process killed earlier, the step would be run again.
+        """
+        with self._changed:
+            self._held_back.append((message_ids, action))
+            self._act()
+
+    def receive(self, consumer: str, port: str, message_id: str) -> None:
+        """Takes note that a message has arrived at a consumer."""
+        with self._changed:
+            for edge in self._edges:
+                if (edge.route.consumer, edge.route.input) == (consumer, port):
+                    edge.received(message_id)
+            self._act()
+
+    def acknowledge(self, consumer: str, consumed: Iterable[tuple[str, str]]) -> None:
+        """Takes note that a consumer has done with (port, message id) pairs."""
+        by_port = {edge.route.input: edge for edge in self._edges if edge.route.consumer == consumer}
+        with self._changed:
+            for port, message_id in consumed:
+                if port in by_port:
+                    by_port[port].acknowledge(message_id)
+            self._act()
+            self._changed.notify_all()
+
+    def update(self, process: Process, present: bool) -> None:
+        """Takes note of a consumer's process that came or went."""
+        with self._changed:
+            for edge in self._edges:
+                if edge.route.consumer == process.stage:
+                    (edge.appeared if present else edge.vanished)(process.replica)
+
+    def close(self) -> None:
+        """Acts on what has not arrived, too: the graph ends and no step will be run again."""
+        with self._changed:
+            self._closed = True
+            self._act()
+
+    def _act(self) -> None:
+        while self._held_back:
+            message_ids, action = self._held_back[0]
+            if not self._closed and any(edge.holds_alone(one) for edge in self._edges for one in message_ids):
+                return
+            self._held_back.popleft()
+            action()
+
+    def _wait_for_room(self, edge: Outgoing, lineage: str) -> None:
+        impatient = time.monotonic() + PATIENCE_SECONDS
+        while not edge.has_room(lineage):
+            if self._stopping():
+                raise Stopped
+            self._changed.wait(POLL_SECONDS)
+            if time.monotonic() > impatient:
+                impatient = float("inf")
+                self._warn(
+                    f"held back: {edge.route.consumer}.{edge.route.input} has {edge.route.queue} lineages to answer, "
+                    f"the oldest since {edge.oldest()}"
+                )

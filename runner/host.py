@@ -1,0 +1,370 @@
+"""The process of one stage: takes messages in, runs steps, sends what they emit and journals them."""
+
+import contextlib
+import itertools
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from runner import codec
+from runner.bus import RECORDER, Bus, Packet, Presence, Process
+from runner.children import die_with_parent
+from runner.codec import CodecError, Envelope, LogLine, Outcome, Receipt, Step
+from runner.contract import Level, Refused
+from runner.delivery import Delivery, Stopped
+from runner.graph import Route, node_from_entry
+from runner.inbox import Inbox, Mismatched, Ready
+from runner.ports import Handler
+from runner.step import Executor, receive, step_time
+
+R = TypeVar("R", Envelope, Step, Receipt)
+
+REMEMBERED = 10_000
+"""Ids a process remembers per process to recognise what it is sent twice."""
+EXIT_FAILED = 1
+EXIT_REFUSED = 2
+
+
+class Assignment(msgspec.Struct, frozen=True):
+    """What a process is told by the supervisor."""
+
+    run: str
+    endpoint: str
+    directory: str
+    stage: str
+    entry: dict[str, Any]
+    """The stage's part of the graph, as :func:`runner.graph.node_entry` writes it."""
+    seed: int
+    routes: tuple[Route, ...]
+    processes: tuple[tuple[str, int], ...]
+    """(stage, replica) of every process that must be there before anything is sent."""
+    replica: int = 0
+    incarnation: int = 0
+    numbers: dict[str, int] = {}
+    """Next sequence number by output port, where an earlier process has emitted some."""
+    started: bool = False
+    """True where an earlier process has run the start handlers."""
+
+
+class Host:
+    """One stage (or replica) between its bus and its handlers."""
+
+    def __init__(self, assignment: Assignment):
+        """Constructs the stage; raises Refused where its settings do not hold."""
+        self._task = assignment
+        self._node = node_from_entry(assignment.stage, assignment.entry)
+        self._stage = self._node.construct()
+        self._bus = Bus(assignment.run, connect=assignment.endpoint)
+        self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
+        self._presence = Presence()
+        self._stopping = threading.Event()
+        self._delivery = Delivery(assignment.routes, self._bus.publish, self._warn, self._stopping.is_set)
+        self._inbox = Inbox(self._node)
+        self._executor = Executor(
+            self._node,
+            self._stage,
+            seed=assignment.seed,
+            directory=Path(assignment.directory),
+            log=self._log,
+            numbers=assignment.numbers,
+        )
+        self._deliveries: queue.SimpleQueue[_Delivered | None] = queue.SimpleQueue()
+        self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
+        """(port, id) of what has arrived, and whether it is consumed."""
+        self._refused = 0
+        self._steps = 0
+
+    def run(self) -> None:
+        """Serves until it is stopped; raises what a handler raises."""
+        self._connect()
+        expected = {*self._task.processes, (RECORDER, 0)}
+        if self._presence.wait_for(expected, self._stopping.is_set):
+            self._start()
+            self._serve()
+
+    def stop(self) -> None:
+        """Ends :meth:`run` after the present step. May be called from a signal handler."""
+        self._stopping.set()
+        self._deliveries.put(None)
+
+    def close(self) -> None:
+        """Lets the recorder catch up, then releases the stage and the bus."""
+        self._say_what_is_left()
+        self._delivery.close()
+        self._bus.flush()
+        self._stage.close()
+        self._bus.close()
+
+    # ------------------------------------------------------------------------------------------ inputs
+
+    def _connect(self) -> None:
+        """Subscribes to everything first and announces this process last: who sees it may send."""
+        for consumer in {route.consumer for route in self._task.routes}:
+            self._bus.subscribe(f"j/{consumer}", self._on_step)
+            self._bus.subscribe(f"r/{consumer}", self._on_receipt)
+        self._bus.subscribe(f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery)
+        self._bus.watch(self._on_presence)
+        self._bus.announce(self._process)
+
+    def _on_presence(self, process: Process, present: bool) -> None:
+        self._presence.update(process, present)
+        self._delivery.update(process, present)
+
+    def _on_step(self, packet: Packet) -> None:
+        """A step that was done acknowledges what it consumed; one that failed will be tried again."""
+        step = self._read(Step, packet)
+        if step is not None and step.outcome == "done":
+            self._delivery.acknowledge(step.stage, step.consumed)
+
+    def _on_receipt(self, packet: Packet) -> None:
+        receipt, consumer = self._read(Receipt, packet), packet.key.rpartition("/")[2]
+        if receipt is not None and receipt.consumed:
+            self._delivery.acknowledge(consumer, [(receipt.port, receipt.id)])
+        elif receipt is not None:
+            self._delivery.receive(consumer, receipt.port, receipt.id)
+
+    def _on_delivery(self, packet: Packet) -> None:
+        """Gives a receipt at once, however long the present step takes."""
+        envelope = self._read(Envelope, packet)
+        if envelope is not None:
+            port = packet.key.rpartition("/")[2]
+            receipt = Receipt(port, envelope.id, consumed=self._arrived.get((port, envelope.id), False))
+            self._bus.publish(f"r/{self._process.stage}", codec.pack(receipt))
+            self._deliveries.put(_Delivered(packet, port, envelope))
+
+    def _read(self, kind: type[R], packet: Packet) -> R | None:
+        try:
+            return codec.unpack(kind, packet.payload)
+        except CodecError as error:
+            self._refuse(packet, error)
+            return None
+
+    def _refuse(self, packet: Packet, error: Exception) -> None:
+        """Counts and shows what cannot be taken; the process lives on."""
+        self._refused += 1
+        self._log(f"{packet.key}: message refused ({self._refused} so far): {error}", "error")
+
+    def _take(self, delivered: "_Delivered") -> None:
+        """Decodes one message into the inbox, unless it has been here before."""
+        packet, envelope = delivered.packet, delivered.envelope
+        if (delivered.port, envelope.id) in self._arrived:
+            return
+        try:
+            port = self._node.type.inputs.get(delivered.port)
+            if port is None:
+                raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
+            travelled = packet.arrived_ns - packet.sent_ns if packet.sent_ns else 0
+            self._inbox.add(receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled))
+            self._arrived[delivered.port, envelope.id] = False
+        except (CodecError, Mismatched) as error:
+            self._refuse(packet, error)
+
+    # ------------------------------------------------------------------------------------------ steps
+
+    def _start(self) -> None:
+        for handler in self._node.type.handlers:
+            if not handler.inputs and not self._task.started:
+                self._step(Ready(handler, ()))
+
+    def _serve(self) -> None:
+        """Works off inputs as they come; a source is advanced in between."""
+        source = None if self._node.type.source is None else self._advance(self._node.type.source)
+        while not self._stopping.is_set():
+            self._take_all(wait=source is None)
+            ready = self._inbox.pop()
+            if ready is not None:
+                self._step(ready)
+            if source is not None and not next(source, False):
+                source = None
+
+    def _take_all(self, *, wait: bool) -> None:
+        """Takes every packet that is there; waits for one if there is nothing else to do."""
+        with contextlib.suppress(queue.Empty):
+            delivered = self._deliveries.get(block=wait and not self._inbox.has_ready)
+            while delivered is not None:
+                self._take(delivered)
+                delivered = self._deliveries.get_nowait()
+
+    def _step(self, ready: Ready) -> None:
+        """Runs one handler to its end and journals it."""
+        time_ns = step_time(self._node, ready.arrivals, time.time_ns())
+        emissions = self._executor.run(ready.handler, ready.arrivals, time_ns)
+        record = _Record(ready, time_ns)
+        try:
+            for envelope in record.timed(emissions):
+                self._emit(envelope)
+                if self._stopping.is_set():
+                    raise Stopped
+        except Stopped:
+            record.outcome = "stopped"
+        except Exception as error:
+            record.outcome, record.error = "failed", _summary(error)
+            raise
+        finally:
+            self._journal(record)
+
+    def _advance(self, handler: Handler) -> Iterator[bool]:
+        """Sends the next message of the source each time it is advanced; every message is a step."""
+        emissions = self._executor.advance(handler, time.time_ns)
+        while True:
+            record = _Record(Ready(handler, ()), time.time_ns())
+            for envelope in record.timed(itertools.islice(emissions, 1)):
+                record.time_ns = envelope.time_ns
+                with contextlib.suppress(Stopped):
+                    self._emit(envelope)
+            if not record.emitted:
+                return
+            self._journal(record)
+            yield True
+
+    def _emit(self, envelope: Envelope) -> None:
+        """Sends a message, to the recorder first."""
+        payload = codec.pack(envelope)
+        port = envelope.id.partition("#")[0].rpartition(".")[2]
+        self._bus.publish(f"m/{self._process.stage}/{port}", payload)
+        self._delivery.publish(port, envelope, payload)
+
+    def _journal(self, record: "_Record") -> None:
+        step = record.step(self._process, self._steps)
+        self._steps += 1
+        if step.outcome == "done":
+            self._remember(step.consumed)
+        payload = codec.pack(step)
+        self._delivery.after_arrival(step.emitted, lambda: self._bus.publish(f"j/{self._process.stage}", payload))
+
+    def _say_what_is_left(self) -> None:
+        """Records what was never worked on."""
+        for handler, lineage, lacking in self._inbox.incomplete():
+            self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
+        if self._inbox.skipped:
+            self._log(f"{self._inbox.skipped} messages were replaced by newer ones before they were read", "debug")
+
+    def _remember(self, consumed: Iterable[tuple[str, str]]) -> None:
+        for key in consumed:
+            self._arrived[key] = True
+        while len(self._arrived) > REMEMBERED:
+            self._arrived.popitem(last=False)
+
+    def _warn(self, text: str) -> None:
+        self._log(text, "warning")
+
+    def _log(self, text: str, level: Level) -> None:
+        line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
+        self._bus.publish(f"l/{self._process.stage}", codec.pack(line))
+
+
+@dataclass(frozen=True, slots=True)
+class _Delivered:
+    """A message as it came, not yet decoded."""
+
+    packet: Packet
+    port: str
+    envelope: Envelope
+
+
+class _Record:
+    """What will be journalled of a step while it runs."""
+
+    def __init__(self, ready: Ready, time_ns: int):
+        self._ready = ready
+        self._started_ns = time.monotonic_ns()
+        self._computed_ns = 0
+        self.time_ns = time_ns
+        self.emitted: list[str] = []
+        self.outcome: Outcome = "done"
+        self.error = ""
+
+    def timed(self, emissions: Iterator[Envelope]) -> Iterator[Envelope]:
+        """Passes emissions on, noting their ids and the time the handler took for them."""
+        while True:
+            begun = time.monotonic_ns()
+            try:
+                envelope = next(emissions, None)
+            finally:
+                self._computed_ns += time.monotonic_ns() - begun
+            if envelope is None:
+                return
+            self.emitted.append(envelope.id)
+            yield envelope
+
+    def step(self, process: Process, number: int) -> Step:
+        """The journal's record."""
+        arrivals = self._ready.arrivals
+        last = max(arrivals, key=lambda arrival: arrival.arrived_ns, default=None)
+        return Step(
+            stage=process.stage,
+            replica=process.replica,
+            incarnation=process.incarnation,
+            number=number,
+            handler=self._ready.handler.name,
+            consumed=tuple((arrival.port.name, arrival.envelope.id) for arrival in arrivals),
+            emitted=tuple(self.emitted),
+            time_ns=self.time_ns,
+            waited_ns=self._started_ns - last.arrived_ns if last else 0,
+            travelled_ns=last.travelled_ns if last else 0,
+            computed_ns=self._computed_ns,
+            outcome=self.outcome,
+            error=self.error,
+        )
+
+
+def _summary(error: Exception) -> str:
+    """An exception in one line: its type, its text and where it was raised."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    place = os.path.relpath(frame.filename)
+    return f"{type(error).__name__}: {error} ({place}:{frame.lineno} in {frame.name})"
+
+
+def main() -> int:
+    """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
+    try:
+        host = Host(assignment)
+    except Refused as refusal:
+        return _fail(str(refusal), EXIT_REFUSED)
+    except Exception as error:
+        traceback.print_exc()
+        return _fail(_summary(error), EXIT_FAILED)
+    signal.signal(signal.SIGTERM, lambda *_: host.stop())
+    return _serve(host)
+
+
+def _serve(host: Host) -> int:
+    code = 0
+    try:
+        host.run()
+    except Refused as refusal:
+        code = _fail(str(refusal), EXIT_REFUSED)
+    except Exception as error:
+        traceback.print_exc()
+        code = _fail(_summary(error), EXIT_FAILED)
+    host.close()
+    return code
+
+
+def _leave(*_: object) -> None:
+    """Before the stage is there, there is nothing to finish."""
+    os._exit(0)
+
+
+def _fail(reason: str, code: int) -> int:
+    print(reason, file=sys.stderr, flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

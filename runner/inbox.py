@@ -1,0 +1,129 @@
+"""Puts messages together to steps: joins and gathers by lineage, whatever the order of arrival."""
+
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import cast
+
+from runner.contract import Part
+from runner.graph import Node
+from runner.ports import Handler, InputPort
+from runner.step import Arrival
+
+
+class Mismatched(Exception):
+    """A message that contradicts what came before it: another count, or the same index twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """A handler and everything it needs, in the order of its parameters."""
+
+    handler: Handler
+    arrivals: tuple[Arrival, ...]
+
+
+@dataclass(slots=True)
+class _Lineage:
+    """What has come of one lineage for one handler."""
+
+    waiting: dict[str, deque[Arrival]] = field(default_factory=dict[str, deque[Arrival]])
+    """By port, in order of arrival."""
+
+
+class Inbox:
+    """Everything that has arrived at one process and is not consumed yet."""
+
+    def __init__(self, node: Node):
+        self._node = node
+        self._lineages = {handler.name: OrderedDict[str, _Lineage]() for handler in node.type.handlers}
+        self._ready: deque[Ready] = deque()
+        self.skipped = 0
+        """Messages that a newer one replaced, on edges of policy ``latest``."""
+
+    def add(self, arrival: Arrival) -> None:
+        """Takes a message; raises Mismatched for a part that contradicts its siblings."""
+        handler = self._node.type.handler_of(arrival.port.name)
+        if self._node.inputs[arrival.port.name].policy == "latest":
+            self._discard_older(handler, arrival.port)
+        lineages = self._lineages[handler.name]
+        lineage = lineages.setdefault(arrival.envelope.lineage, _Lineage())
+        waiting = lineage.waiting.setdefault(arrival.port.name, deque())
+        if arrival.port.kind == "gather":
+            _check_siblings(arrival, waiting)
+        waiting.append(arrival)
+        self._ready.extend(self._complete(handler, lineage))
+        if not any(lineage.waiting.values()):
+            del lineages[arrival.envelope.lineage]
+        self._forget_oldest(handler)
+
+    @property
+    def has_ready(self) -> bool:
+        """Whether a step could run now."""
+        return bool(self._ready)
+
+    def pop(self) -> Ready | None:
+        """The next step in order of completion, or None."""
+        return self._ready.popleft() if self._ready else None
+
+    def incomplete(self) -> Iterator[tuple[Handler, str, list[str]]]:
+        """(handler, lineage, ports that lack) for everything that cannot run yet."""
+        for handler in self._node.type.handlers:
+            for root, lineage in self._lineages[handler.name].items():
+                lacking = [port.name for port in handler.inputs if not _satisfied(port, lineage)]
+                if any(lineage.waiting.get(port.name) for port in handler.inputs if not handler.keeps(port)):
+                    yield handler, root, lacking
+
+    def _complete(self, handler: Handler, lineage: _Lineage) -> Iterator[Ready]:
+        while all(_satisfied(port, lineage) for port in handler.inputs):
+            arrivals = [arrival for port in handler.inputs for arrival in _take(handler, port, lineage)]
+            yield Ready(handler, tuple(arrivals))
+
+    def _discard_older(self, handler: Handler, port: InputPort) -> None:
+        for lineage in self._lineages[handler.name].values():
+            self.skipped += len(lineage.waiting.pop(port.name, ()))
+        if len(handler.inputs) == 1:
+            kept = [ready for ready in self._ready if ready.handler is not handler]
+            self.skipped += len(self._ready) - len(kept)
+            self._ready = deque(kept)
+
+    def _forget_oldest(self, handler: Handler) -> None:
+        """Drops the oldest lineages of which only what stays is left: their parts have been worked on."""
+        limit = 2 * max((self._node.inputs[port.name].queue for port in handler.inputs), default=0)
+        lineages = self._lineages[handler.name]
+        while len(lineages) > limit:
+            finished = next((root for root, lineage in lineages.items() if _only_stays(handler, lineage)), None)
+            if finished is None:
+                return
+            del lineages[finished]
+
+
+def _only_stays(handler: Handler, lineage: _Lineage) -> bool:
+    return not any(lineage.waiting.get(port.name) for port in handler.inputs if not handler.keeps(port))
+
+
+def _satisfied(port: InputPort, lineage: _Lineage) -> bool:
+    waiting = lineage.waiting.get(port.name)
+    if not waiting:
+        return False
+    return port.kind == "one" or len(waiting) == cast("Part", waiting[0].message).count
+
+
+def _take(handler: Handler, port: InputPort, lineage: _Lineage) -> list[Arrival]:
+    waiting = lineage.waiting[port.name]
+    if port.kind == "gather":
+        lineage.waiting[port.name] = deque()
+        return sorted(waiting, key=lambda arrival: cast("Part", arrival.message).index)
+    return [waiting[-1]] if handler.keeps(port) else [waiting.popleft()]
+
+
+def _check_siblings(arrival: Arrival, siblings: deque[Arrival]) -> None:
+    part = cast("Part", arrival.message)
+    if not 0 <= part.index < part.count:
+        raise Mismatched(f"index {part.index} of {part.count}")
+    for sibling in siblings:
+        other = cast("Part", sibling.message)
+        if other.count != part.count:
+            raise Mismatched(f"one of {part.count}, but {sibling.envelope.id} is one of {other.count}")
+        if other.index == part.index:
+            raise Mismatched(f"index {part.index} again, after {sibling.envelope.id}")

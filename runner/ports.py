@@ -1,0 +1,167 @@
+"""Reads a stage's handlers, ports and settings from its annotations."""
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, is_dataclass
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from runner.contract import Context, Message, Part, Refused, Stage
+
+
+@dataclass(frozen=True, slots=True)
+class InputPort:
+    """What one parameter of a handler takes: one message of a lineage, or all parts of it."""
+
+    name: str
+    type: type[Message]
+    kind: Literal["one", "gather"]
+
+
+@dataclass(frozen=True, slots=True)
+class Handler:
+    """A method the runner calls: a join of its inputs, or a start without any."""
+
+    name: str
+    inputs: tuple[InputPort, ...]
+    context: str | None
+    """Name of the parameter that receives the step's context."""
+
+    @property
+    def driver(self) -> InputPort | None:
+        """The input whose message seeds the step's random numbers: the part of a join if any, else the first."""
+        return next((port for port in self.inputs if issubclass(port.type, Part)), next(iter(self.inputs), None))
+
+    def keeps(self, port: InputPort) -> bool:
+        """True for what a join with a part uses again for every part of its lineage."""
+        driver = self.driver
+        return driver is not None and driver.kind == "one" and issubclass(driver.type, Part) and port != driver
+
+
+@dataclass(frozen=True, slots=True)
+class StageType:
+    """What the annotations of a stage class say."""
+
+    cls: type[Stage]
+    handlers: tuple[Handler, ...]
+    """Everything named ``on_*``, in the order of definition."""
+    source: Handler | None
+    """``source``, which only devices have."""
+    outputs: dict[str, type[Message]]
+    config: type[Any] | None
+
+    @property
+    def inputs(self) -> dict[str, InputPort]:
+        """All input ports by name."""
+        return {port.name: port for handler in self.handlers for port in handler.inputs}
+
+    def handler_of(self, port: str) -> Handler:
+        """The handler that takes what arrives on a port."""
+        return next(handler for handler in self.handlers if any(p.name == port for p in handler.inputs))
+
+
+def inspect_stage(cls: type[Stage]) -> StageType:
+    """Reads a stage class; raises Refused naming class, method and parameter where it breaks the contract."""
+    handlers = tuple(_handler(cls, name) for name in _handler_names(cls))
+    source = _handler(cls, "source") if hasattr(cls, "source") else None
+    if source is not None and not cls.device:
+        raise Refused(f"{cls.__name__}.source: only a stage marked `device = True` may be a source")
+    if not handlers and source is None:
+        raise Refused(f"{cls.__name__}: has no handlers; a handler is a method named on_*")
+    _refuse_shared_ports(cls, handlers)
+    methods = [handler.name for handler in handlers] + (["source"] if source else [])
+    outputs = {port_name(kind): kind for name in methods for kind in _message_types(_hints(cls, name)["return"])}
+    return StageType(cls, handlers, source, outputs, _config_type(cls))
+
+
+def port_name(kind: type[Message]) -> str:
+    """Snake case of a message type: ``SceneEstimate`` -> ``scene_estimate``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", kind.__name__).lower()
+
+
+def _handler_names(cls: type[Stage]) -> list[str]:
+    names = (name for base in reversed(cls.__mro__) for name in vars(base) if name.startswith("on_"))
+    return list(dict.fromkeys(names))
+
+
+def _handler(cls: type[Stage], name: str) -> Handler:
+    hints = _hints(cls, name)
+    inputs: list[InputPort] = []
+    context: str | None = None
+    for parameter in list(_signature(cls, name).parameters)[1:]:
+        if hints[parameter] is Context:
+            context = parameter
+        else:
+            inputs.append(_input_port(cls, name, parameter, hints[parameter]))
+    if name == "source" and inputs:
+        raise Refused(f"{cls.__name__}.source({inputs[0].name}): a source takes no messages")
+    _refuse_two_drivers(cls, name, inputs)
+    return Handler(name, tuple(inputs), context)
+
+
+def _signature(cls: type[Stage], name: str) -> inspect.Signature:
+    return inspect.signature(getattr(cls, name))
+
+
+def _hints(cls: type[Stage], name: str) -> dict[str, Any]:
+    """Resolved annotations of a method; every parameter and the result must have one."""
+    method: Callable[..., Any] = getattr(cls, name)
+    try:
+        hints = get_type_hints(method)
+    except NameError as error:
+        raise Refused(f"{cls.__name__}.{name}: an annotation cannot be resolved: {error}") from None
+    for parameter in (*list(_signature(cls, name).parameters)[1:], "return"):
+        if parameter not in hints:
+            raise Refused(f"{cls.__name__}.{name}({parameter}): has no annotation")
+    return hints
+
+
+def _input_port(cls: type[Stage], method: str, parameter: str, annotation: Any) -> InputPort:
+    place = f"{cls.__name__}.{method}({parameter})"
+    if _is_message(annotation):
+        return InputPort(parameter, annotation, "one")
+    if get_origin(annotation) is not list:
+        raise Refused(f"{place}: {annotation} is not a Message, a list of Parts or Context")
+    (item,) = get_args(annotation)
+    if not (_is_message(item) and issubclass(item, Part)):
+        raise Refused(f"{place}: a list gathers Parts, and {getattr(item, '__name__', item)} is not one")
+    return InputPort(parameter, item, "gather")
+
+
+def _refuse_two_drivers(cls: type[Stage], method: str, inputs: list[InputPort]) -> None:
+    parts = [port.name for port in inputs if issubclass(port.type, Part) and port.kind == "one"]
+    gathers = [port.name for port in inputs if port.kind == "gather"]
+    if len(parts) > 1 or (parts and gathers):
+        names = ", ".join(parts + gathers)
+        raise Refused(f"{cls.__name__}.{method}({names}): a handler takes at most one Part, or gathers lists of them")
+
+
+def _refuse_shared_ports(cls: type[Stage], handlers: tuple[Handler, ...]) -> None:
+    owners: dict[str, str] = {}
+    for handler in handlers:
+        for port in handler.inputs:
+            other = owners.setdefault(port.name, handler.name)
+            if other != handler.name:
+                raise Refused(f"{cls.__name__}.{handler.name}({port.name}): {other} takes the port of that name too")
+
+
+def _message_types(annotation: Any) -> Iterator[type[Message]]:
+    """Every Message type inside a return annotation, such as ``Iterator[A | B] | None``."""
+    if _is_message(annotation):
+        yield annotation
+    elif get_origin(annotation) is Annotated:
+        yield from _message_types(get_args(annotation)[0])
+    else:
+        for argument in get_args(annotation):
+            yield from _message_types(argument)
+
+
+def _is_message(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Message)
+
+
+def _config_type(cls: type[Stage]) -> type[Any] | None:
+    config: type[Any] | None = getattr(cls, "Config", None)
+    if config is not None and not (is_dataclass(config) and vars(config)["__dataclass_params__"].frozen):
+        raise Refused(f"{cls.__name__}.Config: must be a frozen dataclass")
+    return config

@@ -1,0 +1,90 @@
+"""Where and with what a graph ran: package versions, source revision, machine, and the files its settings name."""
+
+import hashlib
+import platform
+import subprocess
+from collections.abc import Iterator, Mapping
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+HASHED_BYTES = 64 * 2**20
+"""Larger files are named without a hash."""
+
+
+def package_versions() -> dict[str, str]:
+    """Every installed package."""
+    return {found.name: found.version for found in sorted(distributions(), key=lambda found: found.name.lower())}
+
+
+def revision() -> str:
+    """The git commit of this source, with ``-dirty`` where it was changed since; empty outside a checkout."""
+    commit = _git("rev-parse", "HEAD")
+    return f"{commit}-dirty" if commit and _git("status", "--porcelain", "--untracked-files=no") else commit
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def machine() -> dict[str, str]:
+    """What the last bits of a float may depend on: processor, interpreter and linear algebra."""
+    blas = cast("dict[str, Any]", np.show_config(mode="dicts"))["Build Dependencies"]["blas"]
+    return {
+        "processor": _processor("model name") or platform.processor(),
+        "vectors": " ".join(flag for flag in _processor("flags").split() if flag.startswith(("avx", "fma", "sse4"))),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "blas": f"{blas.get('name')} {blas.get('version')}",
+    }
+
+
+def _processor(key: str) -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
+
+
+def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of every file that a setting of the graph names, for example the catalogue."""
+    texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
+    paths = [Path(text) for text in sorted(texts) if len(text) < 4096 and "\0" not in text]
+    return {str(path): _hash(path) for path in paths if path.is_file()}
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for inner in cast("dict[str, Any]", value).values():
+            yield from _texts(inner)
+    elif isinstance(value, list):
+        for inner in cast("list[Any]", value):
+            yield from _texts(inner)
+
+
+def _hash(path: Path) -> str:
+    if path.stat().st_size > HASHED_BYTES:
+        return f"not hashed, {path.stat().st_size} bytes"
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def portable(value: Any, root: Path) -> Any:
+    """A copy of a tree in which paths below ``root`` are relative to it: another checkout finds its own files."""
+    match value:
+        case str() if value.startswith(f"{root}/"):
+            return str(Path(value).relative_to(root))
+        case dict():
+            return {key: portable(inner, root) for key, inner in cast("dict[str, Any]", value).items()}
+        case list():
+            return [portable(inner, root) for inner in cast("list[Any]", value)]
+        case _:
+            return value

@@ -1,0 +1,322 @@
+"""Runs a graph: starts one process per stage and replica, restarts what crashes, and ends everything together."""
+
+import contextlib
+import itertools
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+
+from runner import codec
+from runner.bus import RECORDER, Bus, Packet, Presence, Process, free_endpoint
+from runner.children import ending, last_lines, signal_group, spawn
+from runner.codec import CodecError, Envelope, LogLine, Receipt, Step
+from runner.contract import Finished, Level, Refused, Restarted
+from runner.delivery import Delivery
+from runner.graph import FINISHED, SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.host import EXIT_REFUSED, Assignment
+from runner.info import stage_times
+from runner.ports import port_name
+from runner.recorder import Manifest, topic
+from runner.step import sequence_of
+from runner.terminal import Terminal
+
+STAGE_GRACE_SECONDS = 2.0
+"""What a stage may take to finish its step before it is killed."""
+RECORDER_GRACE_SECONDS = 2.5
+TICK_SECONDS = 0.05
+SETTLE_SECONDS = 0.2
+"""What a dead process has sent is given this long to arrive before its successor is told where to go on."""
+SHOWN_LINES = 8
+EXIT_INCOMPLETE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Why the graph ended."""
+
+    code: int
+    reason: str
+
+
+@dataclass(slots=True)
+class _Child:
+    process: Process
+    handle: subprocess.Popen[bytes]
+    log: Path
+    started: float = field(default_factory=time.monotonic)
+
+    def reason(self) -> str:
+        """Why it ended: the signal, or the last thing it printed."""
+        code = self.handle.returncode
+        lines = last_lines(self.log, 1)
+        return lines[0] if lines and code is not None and code >= 0 else ending(code or 0)
+
+
+@dataclass(slots=True)
+class _Progress:
+    """How far a stage has come: what its next process must know."""
+
+    numbers: dict[str, int] = field(default_factory=dict[str, int])
+    started: bool = False
+
+    def note(self, step: Step) -> None:
+        if step.outcome == "done" and not step.consumed:
+            self.started = True
+        for message_id in step.emitted if step.outcome == "done" else ():
+            port = message_id.partition("#")[0].rpartition(".")[2]
+            self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(message_id) + 1)
+
+
+class Supervisor:
+    """One run of a graph."""
+
+    def __init__(self, graph: Graph, *, recordings: Path, settings: tuple[str, ...], terminal: Terminal):
+        """Makes the folder of the run; raises Refused where that is not possible."""
+        self._graph = graph
+        self._settings = settings
+        self._terminal = terminal
+        self._run, self.recording = _new_recording(recordings, graph.name)
+        self.directory = self.recording.with_suffix("")
+        self._endpoint = free_endpoint()
+        self._bus = Bus(self._run, listen=self._endpoint)
+        self._stopping = threading.Event()
+        self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.publish, self._warn, self._stopping.is_set)
+        self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
+        self._progress: dict[str, _Progress] = defaultdict(_Progress)
+        self._steps: list[Step] = []
+        self._children: dict[tuple[str, int], _Child] = {}
+        self._recorder: _Child | None = None
+        self._viewer: _Child | None = None
+        self._presence = Presence()
+        self._restarts = 0
+        self._absent = set(graph.processes())
+
+    def run(self, *, view: bool = False) -> End:
+        """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
+        self._connect()
+        self._terminal.show(SUPERVISOR, f"run {self._run} on {self._endpoint}")
+        try:
+            self._recorder = self._start_recorder()
+            if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
+                self._viewer = self._start_viewer()
+            for stage, replica in self._graph.processes():
+                self._children[stage, replica] = self._start(Process(stage, replica))
+            end = self._watch()
+        finally:
+            verdict = self._stop()
+        return self._conclude(end, verdict)
+
+    # ------------------------------------------------------------------------------------------ what is heard
+
+    def _connect(self) -> None:
+        for consumer in {route.consumer for route in self._graph.routes(SUPERVISOR)}:
+            self._bus.subscribe(f"r/{consumer}", self._on_receipt)
+        self._bus.subscribe("j/*", self._on_step)
+        self._bus.subscribe("l/*", self._on_log)
+        self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
+        self._bus.watch(self._on_presence)
+
+    def _on_step(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            step = codec.unpack(Step, packet.payload)
+            self._progress[step.stage].note(step)
+            self._steps.append(step)
+            if step.outcome == "done":
+                self._delivery.acknowledge(step.stage, step.consumed)
+
+    def _on_receipt(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            receipt = codec.unpack(Receipt, packet.payload)
+            if receipt.consumed:
+                self._delivery.acknowledge(packet.key.rpartition("/")[2], [(receipt.port, receipt.id)])
+
+    def _on_log(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            line = codec.unpack(LogLine, packet.payload)
+            if line.stage != SUPERVISOR and line.level != "debug":
+                self._terminal.show(self._name_of(line.stage, line.replica), line.text, line.level)
+
+    def _on_finished(self, packet: Packet) -> None:
+        try:
+            finished = codec.open_envelope(Finished, codec.unpack(Envelope, packet.payload))
+        except CodecError as error:
+            self._say(f"{packet.key}: message refused: {error}", "error")
+        else:
+            self._events.put(End(finished.code, finished.reason))
+
+    def _on_presence(self, process: Process, present: bool) -> None:
+        self._delivery.update(process, present)
+        self._presence.update(process, present)
+        child = self._children.get((process.stage, process.replica))
+        if not present or child is None:
+            return
+        seconds = time.monotonic() - child.started
+        self._terminal.show(self._name_of(process.stage, process.replica), f"ready after {seconds:.1f} s")
+        self._absent.discard((process.stage, process.replica))
+        if not self._absent and not process.incarnation:
+            self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
+
+    # ------------------------------------------------------------------------------------------ processes
+
+    def _start_recorder(self) -> _Child:
+        topics = {
+            f"{stage}/{port}": topic(kind)
+            for stage in (*self._graph.nodes, SUPERVISOR)
+            for port, kind in self._graph.outputs_of(stage).items()
+        }
+        graph = graph_to_json(self._graph)
+        task = Manifest(self._run, self._endpoint, str(self.recording), graph, self._settings, topics)
+        return self._spawn(Process(RECORDER, 0), "runner.recorder", msgspec.json.encode(task))
+
+    def _start(self, process: Process) -> _Child:
+        progress = self._progress[process.stage]
+        task = Assignment(
+            run=self._run,
+            endpoint=self._endpoint,
+            directory=str(self.directory.absolute()),
+            stage=process.stage,
+            entry=node_entry(self._graph.nodes[process.stage]),
+            seed=self._graph.seed,
+            routes=tuple(self._graph.routes(process.stage)),
+            processes=tuple(self._graph.processes()),
+            replica=process.replica,
+            incarnation=process.incarnation,
+            numbers=progress.numbers,
+            started=progress.started,
+        )
+        return self._spawn(process, "runner.host", msgspec.json.encode(task))
+
+    def _spawn(self, process: Process, module: str, task: bytes) -> _Child:
+        log = self.directory / "log" / f"{process.stage}-{process.replica}.txt"
+        return _Child(process, spawn(module, task=task, log=log), log)
+
+    def _start_viewer(self) -> _Child:
+        log = self.directory / "log" / "viewer.txt"
+        handle = spawn("runner.cli", "view", "--live", str(self.recording), task=b"", log=log)
+        self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {log}")
+        return _Child(Process("viewer", 0), handle, log)
+
+    def _recorder_died(self) -> bool:
+        return self._recorder is not None and self._recorder.handle.poll() is not None
+
+    def _watch(self) -> End:
+        """Waits for the end, and replaces what crashes meanwhile."""
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self._events.get(timeout=TICK_SECONDS)
+            end = self._look_after_children()
+            if end is not None:
+                return end
+
+    def _look_after_children(self) -> End | None:
+        if self._recorder is not None and self._recorder_died():
+            return End(1, f"the recorder {self._recorder.reason()}")
+        for child in list(self._children.values()):
+            if child.handle.poll() is not None:
+                end = self._replace(child)
+                if end is not None:
+                    return end
+        return None
+
+    def _replace(self, child: _Child) -> End | None:
+        """Restarts a dead process within its budget; otherwise says why the graph ends."""
+        process, name = child.process, self._name_of(child.process.stage, child.process.replica)
+        if child.handle.returncode == EXIT_REFUSED:
+            return End(EXIT_REFUSED, f"{name}: {child.reason()}")
+        budget = self._graph.nodes[process.stage].restarts
+        if (process.stage, process.replica) in self._absent or process.incarnation >= budget:
+            when = "at start-up" if (process.stage, process.replica) in self._absent else f"after {budget} restarts"
+            self._show_output(child)
+            return End(1, f"{name} failed {when}: {child.reason()}")
+        self._say(f"{name} restarts ({process.incarnation + 1} of {budget}): {child.reason()}", "warning")
+        if child.handle.returncode < 0:
+            self._show_output(child)
+        self._publish_restart(process, child.reason())
+        time.sleep(SETTLE_SECONDS)
+        successor = Process(process.stage, process.replica, process.incarnation + 1)
+        self._children[process.stage, process.replica] = self._start(successor)
+        return None
+
+    def _publish_restart(self, process: Process, reason: str) -> None:
+        message = Restarted(stage=process.stage, replica=process.replica, reason=reason)
+        port = port_name(Restarted)
+        own = f"{SUPERVISOR}.{port}#{self._restarts}"
+        self._restarts += 1
+        envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
+        payload = codec.pack(envelope)
+        self._bus.publish(f"m/{SUPERVISOR}/{port}", payload)
+        self._delivery.publish(port, envelope, payload)
+
+    # ------------------------------------------------------------------------------------------ the end
+
+    def _stop(self) -> str:
+        """Stops the stages, then the recorder, and returns the recorder's verdict."""
+        self._stopping.set()
+        _end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
+        last = [child for child in (self._recorder, self._viewer) if child is not None]
+        _end_all(last, RECORDER_GRACE_SECONDS)
+        self._bus.close()
+        return "" if self._recorder is None else self._recorder.reason()
+
+    def _conclude(self, end: End, verdict: str) -> End:
+        complete = self._recorder is not None and self._recorder.handle.returncode == 0
+        if self._steps:
+            self._terminal.plain("", *stage_times(self._steps), "")
+        self._terminal.plain(f"recording {verdict}")
+        return end if complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
+
+    # ------------------------------------------------------------------------------------------ what is said
+
+    def _say(self, text: str, level: Level) -> None:
+        self._terminal.show(SUPERVISOR, text, level)
+        line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
+        self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
+
+    def _warn(self, text: str) -> None:
+        self._say(text, "warning")
+
+    def _show_output(self, child: _Child) -> None:
+        name = self._name_of(child.process.stage, child.process.replica)
+        for line in last_lines(child.log, SHOWN_LINES):
+            self._terminal.show(name, f"| {line}", "error")
+
+    def _name_of(self, stage: str, replica: int) -> str:
+        node = self._graph.nodes.get(stage)
+        return f"{stage}.{replica}" if node is not None and node.replicated else stage
+
+
+def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
+    """A run id that is not taken and its recording; its folder is made."""
+    base = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for attempt in itertools.count():
+        run = f"{base}-{attempt}" if attempt else base
+        try:
+            (folder / run / "log").mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise Refused(f"{folder / run}: {error.strerror}") from None
+        return run, folder / f"{run}.mcap"
+    raise AssertionError
+
+
+def _end_all(children: list[_Child], grace_seconds: float) -> None:
+    """Asks children to end, kills those that do not, and whatever they have left behind."""
+    for child in children:
+        signal_group(child.handle, signal.SIGTERM)
+    deadline = time.monotonic() + grace_seconds
+    for child in children:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.handle.wait(max(0.0, deadline - time.monotonic()))
+    for child in children:
+        signal_group(child.handle, signal.SIGKILL)
+        child.handle.wait()

@@ -1,0 +1,41 @@
+"""What people see while a graph runs: one line at a time, with the time since the start and who says it."""
+
+import sys
+import threading
+import time
+from typing import TextIO
+
+from runner.contract import Level
+
+WIDTH = 16
+_COLOURS: dict[Level, str] = {"debug": "\033[2m", "info": "", "warning": "\033[33m", "error": "\033[31m"}
+_RESET = "\033[0m"
+
+
+class Terminal:
+    """Prints lines; colours only where somebody looks."""
+
+    def __init__(self, stream: TextIO = sys.stdout):
+        self._stream = stream
+        self._colours = stream.isatty()
+        self._started = time.monotonic()
+        self._lock = threading.Lock()
+
+    def show(self, who: str, text: str, level: Level = "info") -> None:
+        """Prints ``12.3 s  who  text``; further lines of the text keep the whole width."""
+        elapsed = time.monotonic() - self._started
+        head = f"{elapsed:7.1f} s  {who:<{WIDTH}} "
+        for line in text.splitlines() or [""]:
+            self._print(f"{head}{line}".rstrip(), level)
+            head = ""
+
+    def plain(self, *lines: str) -> None:
+        """Prints lines of the command itself."""
+        for line in lines:
+            self._print(line, "info")
+
+    def _print(self, line: str, level: Level) -> None:
+        colour = _COLOURS[level] if self._colours else ""
+        with self._lock:
+            self._stream.write(f"{colour}{line}{_RESET if colour else ''}\n")
+            self._stream.flush()

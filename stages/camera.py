@@ -1,0 +1,167 @@
+"""Looks, from four sources: the simulated world, a BOP data set, a recording and a RealSense camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import msgspec
+
+from runner.contract import Context, Refused, Stage
+from stages.messages import Frame, LookRequest, Snapshot
+from stages.perception.depth_noise import color_noise, structured_light
+from stages.scene.catalogue import Catalogue
+
+
+class SimulatedCamera(Stage):
+    """The simulated robot's head camera: renders each snapshot as a structured-light camera would see it."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """The catalogue whose meshes are rendered; ``noise: false`` gives perfect images."""
+
+        catalogue: Path
+        noise: bool = True
+
+    def __init__(self, config: Config) -> None:
+        # OpenGL and the robot's meshes are for this camera only.
+        from stages.devices import fetch, simulated_camera
+
+        self._noise = config.noise
+        self._fetch, self._K = fetch, simulated_camera.K
+        self._camera = simulated_camera.SimulatedCamera(Catalogue.load(config.catalogue))
+        self._looks = 0
+
+    def on_snapshot(self, snapshot: Snapshot, ctx: Context) -> Frame:
+        """The image from where the encoders say the camera is."""
+        T_base_camera = self._fetch.camera_pose(snapshot.joint_names, snapshot.joint_positions)
+        rgb, depth = self._camera.image(snapshot, T_base_camera)
+        if self._noise:
+            rgb, depth = color_noise(rgb, ctx.rng), structured_light(depth, self._K, ctx.rng)
+        self._looks += 1
+        return Frame(
+            rgb=rgb,
+            depth=depth,
+            K=self._K,
+            T_base_camera=T_base_camera,
+            robot_mask=self._camera.robot_mask(snapshot, T_base_camera, depth),
+            name=snapshot.purpose,
+            index=self._looks - 1,
+            total=0,
+        )
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._camera.close()
+
+
+class DatasetCamera(Stage):
+    """Every image that a BOP data set's targets list, one look each."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """A BOP data set folder; at most ``limit`` images (0: all)."""
+
+        dataset: Path
+        limit: int = 0
+
+        def __post_init__(self) -> None:
+            if self.limit < 0:
+                raise Refused(f"camera.limit = {self.limit}: must be 0 (all images) or more")
+
+    def __init__(self, config: Config) -> None:
+        from stages.devices.bop import read_dataset
+
+        images = read_dataset(config.dataset)
+        self._images = images[: config.limit or len(images)]
+
+    def source(self, ctx: Context) -> Iterator[Frame]:
+        """The images in the order of the targets file."""
+        for index, image in enumerate(self._images):
+            rgb, depth = image.read()
+            yield Frame(
+                rgb=rgb,
+                depth=depth,
+                K=image.K,
+                T_base_camera=None,
+                robot_mask=None,
+                name=f"{image.scene_id:06d}/{image.image_id:06d}",
+                index=index,
+                total=len(self._images),
+                scene_id=image.scene_id,
+                image_id=image.image_id,
+                n_objects=image.n_objects,
+            )
+
+
+class RecordedCamera(Stage):
+    """The frames of a recording once more, for another graph's perception."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """An MCAP file that a runner has written."""
+
+        recording: Path
+
+    def __init__(self, config: Config) -> None:
+        from stages.devices.recorded import RecordedFrames
+
+        self._frames = RecordedFrames(config.recording)
+
+    def source(self, ctx: Context) -> Iterator[Frame]:
+        """The frames in the order in which they were recorded, counted anew."""
+        for index, frame in enumerate(self._frames):
+            yield msgspec.structs.replace(frame, index=index, total=len(self._frames))
+
+
+class RealSenseCamera(Stage):
+    """An Intel RealSense camera that answers each request with its next image."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """Image size, rate and, where several cameras are connected, the serial number."""
+
+        width: int = 640
+        height: int = 480
+        fps: int = 30
+        serial: str = ""
+
+        def __post_init__(self) -> None:
+            for name in ("width", "height", "fps"):
+                if getattr(self, name) < 1:
+                    raise Refused(f"camera.{name} = {getattr(self, name)}: must be at least 1")
+
+    def __init__(self, config: Config) -> None:
+        from stages.devices.realsense import RealSense
+
+        self._camera = RealSense(width=config.width, height=config.height, fps=config.fps, serial=config.serial)
+        self._looks = 0
+
+    def on_look_request(self, look_request: LookRequest, ctx: Context) -> Frame:
+        """The image; the camera does not know where it is."""
+        rgb, depth = self._camera.read()
+        self._looks += 1
+        return Frame(
+            rgb=rgb,
+            depth=depth,
+            K=self._camera.K,
+            T_base_camera=None,
+            robot_mask=None,
+            name=look_request.purpose,
+            index=self._looks - 1,
+            total=0,
+        )
+
+    def close(self) -> None:
+        """Stops streaming."""
+        self._camera.close()

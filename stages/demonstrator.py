@@ -1,0 +1,276 @@
+"""The scripted demonstration: shows a goal, disturbs it, asks for it back and checks every step of the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+from runner.contract import Context, Refused, Stage
+from stages.messages import (
+    Arrangement,
+    Assertion,
+    Goal,
+    LookRequest,
+    Outcome,
+    Plan,
+    RobotState,
+    SceneGraph,
+    Task,
+    Transfer,
+    TransferRequest,
+    Verdict,
+)
+from stages.planning.pddl import goal_pddl
+from stages.scene.catalogue import Catalogue
+from stages.scene.virtual import satisfied
+
+
+class Phase(Enum):
+    """What the demonstrator waits for."""
+
+    ARRANGING = "the person's arrangement"
+    LOOKING = "a scene graph"
+    PLANNING = "a plan"
+    TRANSFERRING = "the outcome of a transfer"
+    DONE = "nothing more"
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Where the episode stands; every handler replaces it as a whole."""
+
+    phase: Phase = Phase.ARRANGING
+    purpose: str = "goal"
+    """What the current scene is looked at for."""
+    repeats: int = 0
+    """Looks at the current scene beyond the first."""
+    looks: int = 0
+    plans: int = 0
+    replans: int = 0
+    transfers: int = 0
+    goal: SceneGraph | None = None
+    scene: SceneGraph | None = None
+    transfer: Transfer | None = None
+    """Requested, and its effect not seen yet."""
+    remainder: tuple[Transfer, ...] = ()
+    """What the newest plan has to do beyond that."""
+    failures: tuple[str, ...] = ()
+    """Key of every transfer that failed or missed its relation, in order."""
+    complaint: str = ""
+    """Why the newest transfer failed; empty where it reached its relation."""
+
+
+class Demonstrator(Stage):
+    """Remembers a demonstrated scene as the goal and drives the robot until it holds again.
+
+    One :class:`State` and no clock. After each transfer the scene is perceived again and planned from again,
+    since targets depend on poses; comparing the new plan with what the old one still had to do says whether
+    the plan was kept, repaired or replaced. Every way through ends in exactly one verdict.
+    """
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """How long to persist."""
+
+        catalogue: str
+        goal_name: str = "breakfast"
+        n_objects: int = 0
+        """Objects that the goal scene must show; 0 accepts any number."""
+        repeats: int = 2
+        """Further looks at a scene in which objects are missing or for which there is no plan."""
+        tries: int = 2
+        """Failures of one transfer before plans avoid it."""
+        max_replans: int = 8
+        """Plans that replace, rather than continue, the one before."""
+        max_transfers: int = 16
+
+        def __post_init__(self) -> None:
+            """Refuses limits that are not counts and names that are no file names."""
+            for name, least in (
+                ("n_objects", 0),
+                ("repeats", 0),
+                ("tries", 1),
+                ("max_replans", 0),
+                ("max_transfers", 1),
+            ):
+                if getattr(self, name) < least:
+                    raise Refused(f"demonstrator.{name}={getattr(self, name)}: must be {least} or more")
+            if not self.goal_name.replace("-", "").replace("_", "").isalnum():
+                raise Refused(
+                    f"demonstrator.goal_name={self.goal_name!r}: must consist of letters, digits, - and _ only"
+                )
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._state = State()
+
+    def on_start(self, ctx: Context) -> Arrangement:
+        """Has the goal scene laid out."""
+        ctx.log(f'the person lays out the goal "{self._config.goal_name}"')
+        return Arrangement(kind="goal")
+
+    def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
+        """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
+        return self._look(self._state.purpose) if self._state.phase is Phase.ARRANGING else None
+
+    def on_scene_graph(
+        self, scene_graph: SceneGraph, ctx: Context
+    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict]:
+        """Remembers the goal, or compares the scene with it and asks for a plan where they differ."""
+        if self._state.phase is not Phase.LOOKING:
+            return
+        self._state = replace(self._state, scene=scene_graph, looks=self._state.looks + 1)
+        missing = self._missing(scene_graph)
+        if missing:
+            yield self._look_again("perception", missing, ctx)
+        elif self._state.goal is None:
+            yield from self._remember(scene_graph, ctx)
+        else:
+            yield self._compare(self._state.goal, scene_graph, ctx)
+
+    def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
+        """Starts the plan's first transfer, or gives up where there is none."""
+        if self._state.phase is not Phase.PLANNING:
+            return None
+        self._state = replace(self._state, plans=self._state.plans + 1)
+        if plan.status == "solved":
+            return self._proceed(plan, ctx)
+        if plan.status == "satisfied":
+            return self._look_again("planner", "the planner finds nothing to do, yet relations are violated", ctx)
+        if self._state.failures:
+            return self._look_again("executor", f"{self._state.complaint}; no other way: {plan.reason}", ctx)
+        return self._look_again("planner", plan.reason, ctx)
+
+    def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | None:
+        """Looks at what the transfer did, whether it claims success or not."""
+        if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
+            return None
+        complaint = "" if outcome.success else f"{outcome.failed_stage}: {outcome.reason}"
+        how = "done" if outcome.success else f"failed at {complaint}"
+        ctx.log(
+            f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
+            level="info" if outcome.success else "warning",
+        )
+        self._state = replace(self._state, complaint=complaint, repeats=0)
+        return self._look(f"after transfer {outcome.number}")
+
+    def _look(self, purpose: str) -> LookRequest:
+        self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
+        suffix = f", look {self._state.repeats + 1}" if self._state.repeats else ""
+        return LookRequest(purpose=purpose + suffix)
+
+    def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Verdict:
+        """One more look at the same scene (its noise is new), or the verdict once these are used up."""
+        if self._state.repeats == self._config.repeats:
+            return self._fail(stage, f"{why} ({self._state.repeats + 1} looks at scene '{self._state.purpose}')", ctx)
+        self._state = replace(self._state, repeats=self._state.repeats + 1)
+        ctx.log(f"{why}; looking again", level="warning")
+        return self._look(self._state.purpose)
+
+    def _missing(self, scene: SceneGraph) -> str:
+        """What the scene lacks that it must show, in words; empty where it is complete."""
+        if self._state.goal is None:
+            few = len(scene.objects) < self._config.n_objects
+            return f"{len(scene.objects)} of {self._config.n_objects} objects seen" if few else ""
+        names = {item.name for item in self._state.goal.objects} - {item.name for item in scene.objects}
+        return f"not seen: {', '.join(sorted(names))}" if names else ""
+
+    def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
+        name = self._config.goal_name
+        self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start", repeats=0, goal=scene)
+        ctx.log(f'goal "{name}" remembered: {len(scene.objects)} objects, {len(scene.assertions)} assertions')
+        yield Goal(name=name, scene=scene, pddl=goal_pddl(name, scene))
+        yield Arrangement(kind="start")
+
+    def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
+        """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
+        self._check_transfer(scene)
+        held, violated = satisfied(goal, scene, self._catalogue)
+        ctx.log(f"scene '{self._state.purpose}': {len(held)} of {len(held) + len(violated)} goal relations hold")
+        if not violated:
+            return self._conclude("", "every relation of the goal holds", ctx)
+        if self._state.transfers == self._config.max_transfers:
+            why = self._state.complaint or f"{violated[0]} does not hold"
+            return self._fail("executor", f"{self._state.transfers} transfers were not enough; {why}", ctx)
+        self._state = replace(self._state, phase=Phase.PLANNING)
+        return Task(goal_name=self._config.goal_name, goal=goal, current=scene, avoid=self._avoided())
+
+    def _check_transfer(self, scene: SceneGraph) -> None:
+        """Compares the scene with what the newest transfer promised; one that failed stays in the plan."""
+        state = self._state
+        if state.transfer is None:
+            return
+        transfer, complaint = state.transfer, state.complaint
+        if not complaint and not _reached(transfer, scene):
+            complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
+        if complaint:
+            state = replace(state, remainder=(transfer, *state.remainder), failures=(*state.failures, transfer.key))
+        self._state = replace(state, transfer=None, complaint=complaint)
+
+    def _avoided(self) -> tuple[str, ...]:
+        failures = self._state.failures
+        return tuple(sorted({key for key in failures if failures.count(key) >= self._config.tries}))
+
+    def _proceed(self, plan: Plan, ctx: Context) -> TransferRequest | Verdict:
+        """Requests the first transfer of a solved plan, unless plans have been replaced too often."""
+        state = self._state
+        assert state.scene is not None  # A plan answers a task, and a task holds a scene.
+        change = "new" if state.plans == 1 else change_of_plan(state.remainder, plan.transfers)
+        steps = ", ".join(f"{transfer.object} to {transfer.destination}" for transfer in plan.transfers)
+        ctx.log(f"plan {state.plans} ({change}): {steps}")
+        replans = state.replans + (change == "replaced")
+        if replans > self._config.max_replans:
+            return self._fail("planner", f"the plan was replaced {replans} times", ctx)
+        first, *rest = plan.transfers
+        number = state.transfers + 1
+        self._state = replace(
+            state, phase=Phase.TRANSFERRING, transfer=first, remainder=tuple(rest), replans=replans, transfers=number
+        )
+        return TransferRequest(transfer=first, scene=state.scene, number=number)
+
+    def _fail(self, stage: str, reason: str, ctx: Context) -> Verdict:
+        ctx.log(f"giving up: {reason}", level="error")
+        return self._conclude(stage, reason, ctx)
+
+    def _conclude(self, failed_stage: str, reason: str, ctx: Context) -> Verdict:
+        state = self._state
+        held: tuple[Assertion, ...] = ()
+        violated: tuple[Assertion, ...] = ()
+        if state.goal is not None and state.scene is not None:
+            held, violated = satisfied(state.goal, state.scene, self._catalogue)
+        self._state = replace(state, phase=Phase.DONE)
+        return Verdict(
+            goal_name=self._config.goal_name,
+            success=not failed_stage,
+            failed_stage=failed_stage,
+            reason=reason,
+            satisfied=held,
+            violated=violated,
+            looks=state.looks,
+            plans=state.plans,
+            transfers=state.transfers,
+        )
+
+
+def change_of_plan(expected: Sequence[Transfer], planned: Sequence[Transfer]) -> str:
+    """How a new plan relates to what the one before still had to do: ``kept``, ``repaired`` or ``replaced``.
+
+    Repaired means that transfers were only inserted or only left out.
+    """
+    before, after = [item.key for item in expected], [item.key for item in planned]
+    if before == after:
+        return "kept"
+    return "repaired" if _subsequence(before, after) or _subsequence(after, before) else "replaced"
+
+
+def _subsequence(part: Sequence[str], whole: Sequence[str]) -> bool:
+    rest = iter(whole)
+    return all(item in rest for item in part)
+
+
+def _reached(transfer: Transfer, scene: SceneGraph) -> bool:
+    arguments = (transfer.object, transfer.destination)
+    return any(item.predicate in ("on", "in") and item.arguments == arguments for item in scene.assertions)

@@ -1,0 +1,115 @@
+"""Frame in, candidate boxes out: by the trained network, or as a file of detections has them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from runner.contract import Context, Refused, Stage
+from stages.devices.bop_detections import Detection, read_detections
+from stages.messages import Candidate, Candidates, Frame
+from stages.perception.detection_network import DetectionNetwork, Detections, detect
+from stages.scene.catalogue import Catalogue
+
+_WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
+
+
+class Detector(Stage):
+    """Looks for the objects that the network was trained on."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """Settings; a candidate is kept when its best label reaches ``threshold``."""
+
+        weights: Path = _WEIGHTS
+        threshold: float = 0.3
+        expected: int = 0
+        """Objects known to be there: where fewer reach the threshold, what reaches ``floor`` is kept as well, since
+        an object that is mostly hidden is better doubted than missed."""
+        floor: float = 0.05
+        max_boxes: int = 12
+        labels: tuple[str, ...] = ()
+        """Objects to look for; empty for all that the network knows."""
+
+        def __post_init__(self) -> None:
+            if not 0 < self.threshold < 1:
+                raise Refused(f"detector.threshold = {self.threshold}: must lie between 0 and 1")
+            if not 0 < self.floor <= self.threshold:
+                raise Refused(f"detector.floor = {self.floor}: must lie above 0 and up to threshold = {self.threshold}")
+            if self.expected < 0:
+                raise Refused(f"detector.expected = {self.expected}: must be 0 or more")
+            if self.max_boxes < 1:
+                raise Refused(f"detector.max_boxes = {self.max_boxes}: must be at least 1")
+
+    def __init__(self, config: Config) -> None:
+        # Sums over several threads are added in another order, which a replay would show as a difference.
+        torch.set_num_threads(1)
+        torch.use_deterministic_algorithms(True)
+        self._config = config
+        self._network = DetectionNetwork.load(config.weights)
+        unknown = sorted(set(config.labels) - set(self._network.labels))
+        if unknown:
+            known = ", ".join(self._network.labels)
+            raise Refused(
+                f"detector.labels: {config.weights.name} does not know {', '.join(unknown)} (it knows {known})"
+            )
+
+    def on_frame(self, frame: Frame, ctx: Context) -> Candidates:
+        """The frame's candidates, most confident first."""
+        labels = self._config.labels or self._network.labels
+        columns = [self._network.labels.index(label) for label in labels]
+        config = self._config
+        found = detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
+        sure = int((found.scores >= config.threshold).sum())
+        if sure >= config.expected:
+            found = Detections(found.boxes[:sure], found.confidences[:sure])
+        message = _candidates(found, labels)
+        ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
+        return message
+
+
+class RecordedDetections(Stage):
+    """Answers each frame with the boxes that a BOP-format detections file holds for it."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """A detections file, and the catalogue that names its categories."""
+
+        detections: Path
+        catalogue: Path
+
+    def __init__(self, config: Config) -> None:
+        names = {item.label: name for name, item in Catalogue.load(config.catalogue).objects.items()}
+        self._labels = tuple(names.values())
+        self._name = config.detections.name
+        self._images: dict[tuple[int, int], list[Detection]] = defaultdict(list)
+        for detection in read_detections(config.detections, names):
+            self._images[detection.scene_id, detection.image_id].append(detection)
+
+    def on_frame(self, frame: Frame, ctx: Context) -> Candidates:
+        """The file's boxes for this image, in the file's order."""
+        detections = self._images.get((frame.scene_id, frame.image_id), [])
+        if not detections:
+            ctx.log(f"{self._name} has no box for scene {frame.scene_id} image {frame.image_id}", level="warning")
+        confidences = np.zeros((len(detections), len(self._labels)))
+        for row, detection in zip(confidences, detections, strict=True):
+            row[self._labels.index(detection.label)] = detection.score
+        boxes = np.array([detection.box for detection in detections]).reshape(-1, 4)
+        return _candidates(Detections(boxes, confidences), self._labels)
+
+
+def _candidates(found: Detections, labels: tuple[str, ...]) -> Candidates:
+    """Equation 1: each box with its most confident label."""
+    candidates = tuple(
+        Candidate(box=box, label=labels[int(row.argmax())], confidence=float(row.max()))
+        for box, row in zip(found.boxes, found.confidences, strict=True)
+    )
+    return Candidates(candidates=candidates, labels=labels, confidences=found.confidences)
+
+
+def _summary(message: Candidates) -> str:
+    return ", ".join(f"{candidate.label} {candidate.confidence:.2f}" for candidate in message.candidates)

@@ -1,0 +1,133 @@
+"""The simulated head camera: renders table, room, objects and robot, and finds the robot's own pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.devices import fetch
+from stages.devices.tabletop import TABLE
+from stages.messages import Snapshot
+from stages.messages.arrays import Depth, Mask, Rgb
+from stages.perception.camera_model import intrinsics
+from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
+from stages.scene.catalogue import Catalogue, Floats, Mesh
+from stages.scene.meshes import block
+
+WIDTH, HEIGHT = fetch.CAMERA_SIZE
+K = intrinsics(fetch.CAMERA_FOCAL, WIDTH, HEIGHT)
+ROBOT_MARGIN = 0.03
+"""Metres by which the robot's surface may lie behind a reading and still be what was read."""
+_MASK_GROWTH = 3
+_ROOM_LIGHT = Lighting(
+    lights=(
+        Light("directional", (0.35, 0.25, -1.0), 2.0),
+        Light("directional", (0.60, -0.50, -0.55), 1.1),
+        Light("directional", (-0.40, 0.20, -0.70), 0.5),
+    ),
+    ambient=(0.36, 0.36, 0.38),
+)
+_SKY = (214, 218, 222)
+
+
+class SimulatedCamera:
+    """Renders snapshots of the simulated world. One per process: it owns an OpenGL context."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._renderer = Renderer(WIDTH, HEIGHT)
+        self._room = tuple(room())
+
+    def image(self, snapshot: Snapshot, T_base_camera: Floats) -> tuple[Rgb, Depth]:
+        """The lit colour image (H x W x 3) and the perfect depth image (H x W, metres)."""
+        camera = Camera(K, T_base_camera)
+        items = [*self._room, *self._objects(snapshot), *robot(snapshot.joint_names, snapshot.joint_positions)]
+        rgb = self._renderer.color(items, camera, lighting=_ROOM_LIGHT, background=_SKY)
+        return rgb, self._renderer.depth(items, camera)
+
+    def robot_mask(self, snapshot: Snapshot, T_base_camera: Floats, depth: Depth) -> Mask:
+        """Where the robot is in the image, H x W, from its encoders and the observed ``depth`` alone.
+
+        Pixels that the robot's rendered surface covers, unless the reading lies clearly in front of it; grown by
+        three pixels for noise at its outline.
+        """
+        items = robot(snapshot.joint_names, snapshot.joint_positions)
+        body = self._renderer.depth(items, Camera(K, T_base_camera))
+        return robot_pixels(body, depth)
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._renderer.close()
+
+    def _objects(self, snapshot: Snapshot) -> list[Item]:
+        poses = zip(snapshot.names, snapshot.T_base_objects, strict=True)
+        return [Item(self._catalogue[name].mesh, T_base_object) for name, T_base_object in poses]
+
+
+def robot_pixels(body: Depth, depth: Depth) -> Mask:
+    """Where the rendered robot ``body`` (H x W, 0 = not there) explains the observed ``depth`` (H x W)."""
+    covered = (body > 0) & ((depth == 0) | (body < depth + ROBOT_MARGIN))
+    kernel = np.ones((2 * _MASK_GROWTH + 1, 2 * _MASK_GROWTH + 1), np.uint8)
+    return cv2.dilate(covered.astype(np.uint8), kernel).astype(bool)
+
+
+def robot(joint_names: Sequence[str], positions: Floats) -> list[Item]:
+    """Every link of the robot where the joint positions put it."""
+    T_base_links = fetch.link_poses(joint_names, positions)
+    return [Item(mesh, T_base_links[link]) for link, mesh in fetch.robot_meshes()]
+
+
+def room() -> list[Item]:
+    """Table, floor and walls, in the robot's base frame."""
+    x, y = TABLE.center
+    depth, width = TABLE.size
+    top = _painted((depth, width, TABLE.thickness), 0.012, _planks)
+    leg = _painted((0.05, 0.05, TABLE.height - TABLE.thickness), 0.2, _plain((92, 84, 78)))
+    leg_height = (TABLE.height - TABLE.thickness) / 2
+    corners = [(sx * (depth / 2 - 0.05), sy * (width / 2 - 0.05)) for sx in (-1, 1) for sy in (-1, 1)]
+    floor = _painted((6.0, 6.0, 0.02), 0.05, _tiles)
+    wall = _painted((0.02, 6.0, 2.6), 0.1, _plain((206, 204, 196)))
+    side = _painted((6.0, 0.02, 2.6), 0.1, _plain((196, 202, 206)))
+    return [
+        _at(top, x, y, TABLE.height - TABLE.thickness / 2),
+        *(_at(leg, x + dx, y + dy, leg_height) for dx, dy in corners),
+        _at(floor, 1.0, 0.0, -0.01),
+        _at(wall, 2.6, 0.0, 1.3),
+        *(_at(side, 1.0, sign * 2.4, 1.3) for sign in (-1, 1)),
+    ]
+
+
+Paint = Callable[[Floats], NDArray[np.uint8]]
+
+
+def _painted(size: tuple[float, float, float], step: float, paint: Paint) -> Mesh:
+    """A box of full extents ``size`` whose vertices, ``step`` metres apart, are coloured by ``paint``."""
+    shape = block(size, step=step)
+    return Mesh(shape.vertices, shape.faces.astype(np.int32), paint(shape.vertices))
+
+
+def _plain(color: tuple[int, int, int]) -> Paint:
+    return lambda vertices: np.tile(np.array(color, np.uint8), (len(vertices), 1))
+
+
+def _planks(vertices: Floats) -> NDArray[np.uint8]:
+    """Pale wood with a grain along y and slightly different planks."""
+    x, y = vertices[:, 0], vertices[:, 1]
+    plank = np.floor(x / 0.14)
+    shade = 1 + 0.04 * np.sin(7.3 * plank) + 0.02 * np.sin(260 * x + 3 * np.sin(6 * y + plank))
+    return (np.array([203, 190, 170]) * shade[:, None]).clip(0, 255).astype(np.uint8)
+
+
+def _tiles(vertices: Floats) -> NDArray[np.uint8]:
+    """Grey floor tiles of half a metre."""
+    dark = (np.floor(vertices[:, 0] / 0.5) + np.floor(vertices[:, 1] / 0.5)) % 2 == 0
+    return np.where(dark[:, None], (136, 138, 142), (158, 160, 162)).astype(np.uint8)
+
+
+def _at(mesh: Mesh, x: float, y: float, z: float) -> Item:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return Item(mesh, T)

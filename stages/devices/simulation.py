@@ -1,0 +1,140 @@
+"""The simulated world: Fetch at a table with catalogue objects, in MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from stages.devices import fetch, tabletop
+from stages.perception.poses import pose
+from stages.planning.collision import add_primitives, add_table, quaternion
+from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+
+_TIMESTEP = 0.002
+_SETTLE_AFTER_MOTION = 0.25
+_GRIPPER_RAMP = 0.6
+"""Seconds over which a new gripper opening is commanded."""
+_GRIPPER_HOLD = 0.3
+"""Seconds for the fingers to stall or arrive."""
+_DROP = 0.002
+"""Metres above their support at which objects are laid out."""
+
+
+class Simulation:
+    """Physics of one robot and the objects ``names`` of the catalogue; all poses in the robot base frame.
+
+    Objects are held by friction alone: elliptic friction cones, torsional friction at the finger pads and fingers
+    coupled as on the real gripper keep what is held from creeping.
+    """
+
+    def __init__(self, catalogue: Catalogue, names: tuple[str, ...]) -> None:
+        self.names = names
+        spec = fetch.specification()
+        option = spec.option
+        option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+        # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
+        option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        add_table(spec, tabletop.TABLE)
+        for name in names:
+            _add_object(spec, name, catalogue[name])
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._index()
+
+    @property
+    def time(self) -> float:
+        """Simulated seconds."""
+        return float(self._data.time)
+
+    def arrange(self, layout: Mapping[str, Floats], *, settle: float = 1.5) -> None:
+        """Puts the robot at home and the objects at ``layout`` (T_base_object, 4 x 4), then lets physics settle."""
+        now = self._data.time
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.time = now
+        self._go_home()
+        for name, T in layout.items():
+            position = T[:3, 3] + [0, 0, _DROP]
+            self._data.joint(name).qpos[:] = np.concatenate([position, quaternion(T[:3, :3])])
+        self.run(settle)
+
+    def run(self, seconds: float) -> None:
+        """Lets time pass."""
+        for _ in range(round(seconds / _TIMESTEP)):
+            mujoco.mj_step(self._model, self._data)
+
+    def follow(self, joint_names: tuple[str, ...], times: Floats, positions: Floats, velocities: Floats) -> float:
+        """Follows a joint trajectory (T, T x J, T x J) with velocity feed-forward; returns the largest joint error."""
+        actuators = np.array([self._model.actuator(name).id for name in joint_names])
+        addresses = np.array([self._model.joint(name).qposadr[0] for name in joint_names])
+        lag = -self._model.actuator_biasprm[actuators, 2] / self._model.actuator_gainprm[actuators, 0]
+        targets, rates = _resample(times, positions, velocities)
+        worst = 0.0
+        for target, command in zip(targets, targets + lag * rates, strict=True):
+            self._data.ctrl[actuators] = command
+            mujoco.mj_step(self._model, self._data)
+            worst = max(worst, float(np.abs(self._data.qpos[addresses] - target).max()))
+        self._data.ctrl[actuators] = targets[-1]
+        self.run(_SETTLE_AFTER_MOTION)
+        return worst
+
+    def move_gripper(self, width: float) -> None:
+        """Drives the fingers towards ``width`` metres apart; they stall with limited force at what is between them."""
+        start, end = self._data.ctrl[self._fingers[0]], fetch.GRIPPER.finger(width)
+        steps = round(_GRIPPER_RAMP / _TIMESTEP)
+        for k in range(1, steps + 1):
+            self._data.ctrl[self._fingers] = start + (end - start) * k / steps
+            mujoco.mj_step(self._model, self._data)
+        self.run(_GRIPPER_HOLD)
+
+    def encoders(self) -> Floats:
+        """Positions of :data:`stages.devices.fetch.JOINT_NAMES`."""
+        return self._data.qpos[self._joints].copy()
+
+    def gripper_width(self) -> float:
+        """Metres between the fingers."""
+        return sum(fetch.GRIPPER.width(float(self._data.joint(name).qpos[0])) for name in fetch.FINGER_JOINTS) / 2
+
+    def object_poses(self) -> Floats:
+        """N x 4 x 4: T_base_object of every object, in the order of ``names``."""
+        bodies = [self._data.body(name) for name in self.names]
+        return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies])
+
+    def _go_home(self) -> None:
+        for name, position in fetch.HOME.items():
+            self._data.joint(name).qpos[0] = position
+            self._data.actuator(name).ctrl[0] = position
+        finger = fetch.GRIPPER.finger(fetch.GRIPPER.open_width)
+        for name in fetch.FINGER_JOINTS:
+            self._data.joint(name).qpos[0] = finger
+        self._data.ctrl[self._fingers] = finger
+
+    def _index(self) -> None:
+        self._joints = np.array([self._model.joint(name).qposadr[0] for name in fetch.JOINT_NAMES])
+        self._fingers = np.array([self._model.actuator(name).id for name in fetch.FINGER_JOINTS])
+
+
+def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject) -> None:
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    geoms = add_primitives(body, entry.collision)
+    volumes = [_volume(primitive.kind, primitive.size) for primitive in entry.collision]
+    for geom, volume in zip(geoms, volumes, strict=True):
+        geom.mass = entry.mass * volume / sum(volumes)
+        geom.friction, geom.condim, geom.solref = [entry.friction, 0.01, 0.001], 4, [0.01, 1]
+
+
+def _volume(kind: str, size: tuple[float, ...]) -> float:
+    return float(np.prod(size)) if kind == "box" else float(np.pi * size[0] ** 2 * size[1])
+
+
+def _resample(times: Floats, positions: Floats, velocities: Floats) -> tuple[Floats, Floats]:
+    """The trajectory at every time step of the simulation."""
+    if len(times) < 2:
+        return positions, velocities
+    spline = CubicHermiteSpline(times, positions, velocities)
+    steps = np.minimum(np.arange(1, round(times[-1] / _TIMESTEP) + 1) * _TIMESTEP, times[-1])
+    return spline(steps), spline(steps, 1)

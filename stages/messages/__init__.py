@@ -1,0 +1,49 @@
+"""Every type that crosses a process boundary.
+
+Units are SI (metres, radians, seconds) unless a name says otherwise. ``T_a_b`` maps coordinates of frame
+``b`` to frame ``a``: ``p_a = T_a_b @ p_b``. Frames: ``base`` the robot's base_link (x forward, z up),
+``camera`` the optical frame (x right, y down, z forward; pixel centres at integer coordinates), ``table``
+the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defines it.
+"""
+
+from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
+from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
+from stages.messages.robot import RobotCommand, RobotState
+from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
+from stages.messages.sensing import Frame, LookRequest, Snapshot
+from stages.messages.task import Arrangement, Goal, Outcome, Plan, Task, Transfer, TransferRequest, Verdict
+
+__all__ = [
+    "Arrangement",
+    "Assertion",
+    "Box",
+    "Candidate",
+    "Candidates",
+    "Depth",
+    "Frame",
+    "Goal",
+    "Hypothesis",
+    "Intrinsics",
+    "LookRequest",
+    "Mask",
+    "ObjectPose",
+    "Observation",
+    "Outcome",
+    "Plan",
+    "Points",
+    "Pose",
+    "Poses",
+    "Posterior",
+    "Rgb",
+    "RobotCommand",
+    "RobotState",
+    "SceneEstimate",
+    "SceneGraph",
+    "Snapshot",
+    "Task",
+    "Transfer",
+    "TransferRequest",
+    "Vector",
+    "Verdict",
+    "VirtualObject",
+]

@@ -1,0 +1,49 @@
+"""Looking: a request, the simulator's answer and the RGB-D frame."""
+
+from typing import ClassVar
+
+from runner.contract import Message
+from stages.messages.arrays import Depth, Intrinsics, Mask, Pose, Poses, Rgb, Vector
+
+
+class LookRequest(Message, frozen=True, kw_only=True):
+    """Asks the camera for one frame. Everything perceived from that frame hangs on this request."""
+
+    starts_lineage: ClassVar[bool] = True
+    purpose: str
+    """Shown to people, for example ``goal``, ``start`` or ``after transfer 2``."""
+
+
+class Snapshot(Message, frozen=True, kw_only=True):
+    """The simulated world at one instant, for the simulated camera to render and the report to score.
+
+    Holds the simulator's truth: no stage that perceives, plans or acts may consume it.
+    """
+
+    names: tuple[str, ...]
+    T_base_objects: Poses
+    joint_names: tuple[str, ...]
+    joint_positions: Vector
+    time: float
+    """Simulated seconds."""
+    purpose: str = ""
+
+
+class Frame(Message, frozen=True, kw_only=True):
+    """One RGB-D image, rectified, depth registered to colour."""
+
+    rgb: Rgb
+    depth: Depth
+    K: Intrinsics
+    T_base_camera: Pose | None
+    """Where the camera is; None where the source does not know (data sets of images)."""
+    robot_mask: Mask | None
+    """True where the robot's own body is in the image, from its encoders and meshes."""
+    name: str
+    index: int
+    total: int
+    """How many frames the source will send in all; 0 where it does not end."""
+    scene_id: int = 0
+    image_id: int = 0
+    n_objects: int | None = None
+    """Number of objects where the source knows it (a data set's targets)."""

@@ -1,0 +1,106 @@
+"""Demonstrating, planning and acting."""
+
+from typing import Literal
+
+from runner.contract import Message, Struct
+from stages.messages.arrays import Poses
+from stages.messages.scene import Assertion, SceneGraph
+
+FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release"]
+
+
+class Arrangement(Message, frozen=True, kw_only=True):
+    """Asks the person (scripted, in simulation) to lay out a scene."""
+
+    kind: Literal["goal", "start"]
+
+
+class Goal(Message, frozen=True, kw_only=True):
+    """A demonstrated scene, remembered by name."""
+
+    name: str
+    scene: SceneGraph
+    pddl: str
+    """The goal as a PDDL problem fragment; pose labels are tied to poses in comments."""
+
+
+class Task(Message, frozen=True, kw_only=True):
+    """Asks the planner to turn ``current`` into ``goal``."""
+
+    goal_name: str
+    goal: SceneGraph
+    current: SceneGraph
+    avoid: tuple[str, ...] = ()
+    """Transfers that failed and should not be tried the same way again (``Transfer.key``)."""
+
+
+class Transfer(Struct, frozen=True, kw_only=True):
+    """A pick and the place that follows it: what the executor does as one."""
+
+    object: str
+    source: str
+    """What supports the object now (``table`` or an object)."""
+    destination: str
+    """What supports it afterwards."""
+    T_base_targets: Poses
+    """Poses of the object that would do, best first."""
+    pick: str
+    """The symbolic action, for example ``(pick cup table)``."""
+    place: str
+
+    @property
+    def key(self) -> str:
+        """Names the transfer whatever its poses are, for ``Task.avoid``."""
+        return f"{self.object}: {self.source} -> {self.destination}"
+
+
+class Plan(Message, frozen=True, kw_only=True):
+    """The planner's answer: transfers in order, or the reason why there are none."""
+
+    status: Literal["satisfied", "solved", "refused"]
+    reason: str
+    transfers: tuple[Transfer, ...]
+    actions: tuple[str, ...]
+    domain_pddl: str
+    problem_pddl: str
+    expanded: int = 0
+    """Search states expanded."""
+
+
+class TransferRequest(Message, frozen=True, kw_only=True):
+    """Asks the executor for one transfer in the scene as it was last perceived."""
+
+    transfer: Transfer
+    scene: SceneGraph
+    number: int
+
+
+class Outcome(Message, frozen=True, kw_only=True):
+    """How a transfer ended."""
+
+    number: int
+    object: str
+    destination: str
+    success: bool
+    failed_stage: FailedStage
+    reason: str
+    grasp: str
+    """Name of the grasp that was used."""
+    attempts: int
+    robot_seconds: float
+    planning_seconds: float
+
+
+class Verdict(Message, frozen=True, kw_only=True):
+    """The demonstrator's last word on a goal: each relation, satisfied or not."""
+
+    goal_name: str
+    success: bool
+    failed_stage: str
+    reason: str
+    satisfied: tuple[Assertion, ...]
+    violated: tuple[Assertion, ...]
+    looks: int = 0
+    """Scenes perceived, plans made and transfers tried on the way to this verdict."""
+    plans: int = 0
+    transfers: int = 0

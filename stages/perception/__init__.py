@@ -1,0 +1,1 @@
+"""Camera model, rendering, likelihood, particle filter, detection network and symmetry."""

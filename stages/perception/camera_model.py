@@ -1,0 +1,58 @@
+"""The pinhole camera: pixels to rays and points, points to pixels, intrinsics of scaled and cropped images.
+
+The convention is OpenCV's: x right, y down, z forward, pixel centres at integer coordinates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.messages.arrays import Depth, Intrinsics
+from stages.scene.catalogue import Floats
+
+
+def intrinsics(focal: float, width: int, height: int) -> Intrinsics:
+    """K (3 x 3) of an ideal camera whose axis passes through the middle of the image."""
+    return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def rays(K: Intrinsics, height: int, width: int) -> Floats:
+    """The point on each pixel's ray at z = 1, H x W x 3."""
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    y = (v - K[1, 2]) / K[1, 1]
+    x = (u - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def ray_factors(K: Intrinsics, height: int, width: int) -> Floats:
+    """Metres along each pixel's ray per metre of depth, H x W.
+
+    Two points on one pixel's ray are ``|z_a - z_b| * factor`` apart.
+    """
+    return np.linalg.norm(rays(K, height, width), axis=-1)
+
+
+def back_project(depth: Depth, K: Intrinsics) -> Floats:
+    """Points in the camera frame, H x W x 3, metres; the origin where there is no reading."""
+    return rays(K, *depth.shape) * depth[..., None].astype(np.float64)
+
+
+def project(points: Floats, K: Intrinsics) -> Floats:
+    """Pixel coordinates (u, v) of points in the camera frame, ... x 3 to ... x 2; z must not be 0."""
+    homogeneous = points @ K.T
+    return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def scaled(K: Intrinsics, factor: float) -> Intrinsics:
+    """K of the image resized by ``factor``: the image's corners lie at -0.5, half a pixel from the first centre."""
+    result = K.astype(np.float64)
+    result[:2] *= factor
+    result[:2, 2] += 0.5 * factor - 0.5
+    return result
+
+
+def cropped(K: Intrinsics, x0: float, y0: float) -> Intrinsics:
+    """K of the image whose first pixel is (x0, y0) of the original."""
+    result = K.astype(np.float64)
+    result[:2, 2] -= (x0, y0)
+    return result

@@ -1,0 +1,193 @@
+"""Numba kernels over the pixels of one object's window: the cost of poses and their Gauss-Newton refinement."""
+
+# ruff: noqa: PLR0917, PLW3301
+# Kernels take plain arrays by position, and only nested minima of two values compile to vector instructions.
+# pyright: basic
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from stages.perception.rasteriser import INLINED, KERNEL, fill, screen_bounds, screen_matrix, set_up
+
+IMPOSSIBLE = 1e6
+"""Cost of a pose that reaches into the camera, in metres times pixels."""
+_f = np.float32
+_u = np.uintp
+
+
+@numba.njit(**KERNEL)
+def change_of_cost(lanes, blocks, corners, support, poses, view, background, observed, factor, credit, plane, limits,
+              Z, scratch, out):  # fmt: skip
+    """Writes for each pose what its visible pixels cost less what the background costs there, plus sinking."""
+    width = int(view[4])
+    area = view[4] * view[5]
+    for p in range(poses.shape[0]):
+        m = screen_matrix(poses[p], view)
+        x0, y0, x1, y1 = screen_bounds(corners, m, view)
+        if x0 > view[4]:
+            out[p] = _f(IMPOSSIBLE)
+            continue
+        sunk = _depth_below(support, poses[p], plane) - limits[3]
+        out[p] = max(_f(0), sunk) * area
+        if x1 < x0 or y1 < y0:
+            continue
+        columns = int(x1 - x0) + 1
+        set_up(lanes, blocks, m, x0, x1, y0, y1, scratch)
+        fill(scratch, blocks, Z, columns)
+        out[p] += _scan(Z, int(x0), int(y0), columns, int(y1 - y0) + 1, width, background, observed, factor, credit,
+                        limits)  # fmt: skip
+
+
+@numba.njit(**INLINED)
+def _scan(Z, x0, y0, columns, rows, width, background, observed, factor, credit, limits):
+    """Sums the change of cost over the object's visible pixels and leaves the z-buffer zeroed."""
+    truncation, margin, occluder = limits[0], limits[1], limits[2]
+    total = _f(0)
+    for y in range(_u(rows)):
+        z = y * _u(columns)
+        o = (_u(y0) + y) * _u(width) + _u(x0)
+        for x in range(_u(columns)):
+            q = Z[z + x]
+            Z[z + x] = _f(0)
+            i = o + x
+            behind = factor[i] * (_f(1) / q - observed[i])
+            cost = min(abs(behind), truncation) - credit[i]
+            cost = occluder if behind > margin else cost
+            total += cost if (q > background[i] and factor[i] > _f(0)) else _f(0)
+    return total
+
+
+@numba.njit(**INLINED)
+def _depth_below(support, pose, plane):
+    """How far the lowest point lies below the plane, metres (negative above)."""
+    a = plane[0] * pose[0, 0] + plane[1] * pose[1, 0] + plane[2] * pose[2, 0]
+    b = plane[0] * pose[0, 1] + plane[1] * pose[1, 1] + plane[2] * pose[2, 1]
+    c = plane[0] * pose[0, 2] + plane[1] * pose[1, 2] + plane[2] * pose[2, 2]
+    d = plane[0] * pose[0, 3] + plane[1] * pose[1, 3] + plane[2] * pose[2, 3] + plane[3]
+    lowest = _f(1e9)
+    for i in range(support.shape[0]):
+        lowest = min(lowest, a * support[i, 0] + b * support[i, 1] + c * support[i, 2] + d)
+    return -lowest
+
+
+@numba.njit(**KERNEL)
+def gauss_newton(lanes, blocks, corners, centre, poses, steps, gate, view, background, observed, factor, directions,
+                  Z, scratch):  # fmt: skip
+    """Moves each pose, in place, by steps of projective point-to-plane ICP."""
+    degrees = directions.shape[1]
+    A = np.zeros((degrees, degrees))
+    b = np.zeros(degrees)
+    row = np.zeros(degrees)
+    middle = np.zeros(3)
+    twist = np.zeros(6)
+    for p in range(poses.shape[0]):
+        reach = gate
+        for _ in range(steps):
+            m = screen_matrix(poses[p].astype(np.float32), view)
+            x0, y0, x1, y1 = screen_bounds(corners, m, view)
+            if x1 < x0 or y1 < y0:
+                break
+            columns, rows = int(x1 - x0) + 1, int(y1 - y0) + 1
+            set_up(lanes, blocks, m, x0, x1, y0, y1, scratch)
+            fill(scratch, blocks, Z, columns)
+            for i in range(3):
+                middle[i] = poses[p, i, 3]
+                for j in range(3):
+                    middle[i] += poses[p, i, j] * centre[j]
+            used = _normal_equations(Z, int(x0), int(y0), columns, rows, view, background, observed, factor,
+                                     middle, reach, directions, A, b, row)  # fmt: skip
+            Z[: columns * rows] = _f(0)
+            if used < 12:
+                break
+            _solve(A, b)
+            for i in range(6):
+                twist[i] = 0.0
+                for j in range(degrees):
+                    twist[i] += directions[i, j] * b[j]
+            _move(poses[p], middle, twist)
+            reach = max(0.8 * reach, 0.005)
+
+
+@numba.njit(**INLINED)
+def _normal_equations(Z, x0, y0, columns, rows, view, background, observed, factor, middle, gate, directions, A, b,
+                      row):  # fmt: skip
+    """Accumulates A x = b over visible pixels near their reading; returns how many took part.
+
+    Inverse depth is linear on a plane, so its image gradient is the rendered surface's normal.
+    """
+    A[:] = 0.0
+    b[:] = 0.0
+    used = 0
+    for v in range(1, rows - 1):
+        for u in range(1, columns - 1):
+            i = v * columns + u
+            q, left, right, up, down = Z[i], Z[i - 1], Z[i + 1], Z[i - columns], Z[i + columns]
+            k = (y0 + v) * int(view[4]) + x0 + u
+            if q <= background[k] or factor[k] == 0 or min(min(left, right), min(up, down)) <= 0:
+                continue
+            bend = max(abs(left + right - 2 * q), abs(up + down - 2 * q))
+            offset = observed[k] - 1.0 / q
+            if bend > 0.01 * q or abs(offset) > gate:
+                continue
+            x, y = (x0 + u - view[2]) / view[0], (y0 + v - view[3]) / view[1]
+            nx, ny = 0.5 * (right - left) * view[0], 0.5 * (down - up) * view[1]
+            nz = q - x * nx - y * ny
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            nx, ny, nz = nx / length, ny / length, nz / length
+            residual = (nx * x + ny * y + nz) * offset
+            px, py, pz = x / q - middle[0], y / q - middle[1], 1.0 / q - middle[2]
+            jx, jy, jz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+            weight = 1.0 / (1.0 + (residual / 0.004) ** 2)
+            for j in range(row.shape[0]):
+                row[j] = (directions[0, j] * jx + directions[1, j] * jy + directions[2, j] * jz
+                          + directions[3, j] * nx + directions[4, j] * ny + directions[5, j] * nz)  # fmt: skip
+            for j in range(row.shape[0]):
+                b[j] += weight * row[j] * residual
+                for n in range(j + 1):
+                    A[j, n] += weight * row[j] * row[n]
+            used += 1
+    return used
+
+
+@numba.njit(**INLINED)
+def _solve(A, b):
+    """Solves A x = b in place by a damped Cholesky factorisation; A holds the lower triangle."""
+    n = b.shape[0]
+    for j in range(n):
+        A[j, j] = A[j, j] * 1.001 + 1e-6
+    for j in range(n):
+        for k in range(j):
+            A[j, j] -= A[j, k] * A[j, k]
+        A[j, j] = np.sqrt(max(A[j, j], 1e-12))
+        for i in range(j + 1, n):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] /= A[j, j]
+    for i in range(n):
+        for k in range(i):
+            b[i] -= A[i, k] * b[k]
+        b[i] /= A[i, i]
+    for r in range(n):
+        i = n - 1 - r
+        for k in range(i + 1, n):
+            b[i] -= A[k, i] * b[k]
+        b[i] /= A[i, i]
+
+
+@numba.njit(**INLINED)
+def _move(pose, middle, twist):
+    """Turns a pose by twist[:3] about ``middle`` and shifts it by twist[3:], in place."""
+    angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2) + 1e-12
+    x, y, z = twist[0] / angle, twist[1] / angle, twist[2] / angle
+    s, c = np.sin(angle), np.cos(angle)
+    d = 1.0 - c
+    for j in range(4):
+        shift = 1.0 if j == 3 else 0.0
+        a0, a1, a2 = (pose[0, j] - shift * middle[0], pose[1, j] - shift * middle[1], pose[2, j] - shift * middle[2])
+        pose[0, j] = (c + x * x * d) * a0 + (x * y * d - z * s) * a1 + (x * z * d + y * s) * a2
+        pose[1, j] = (x * y * d + z * s) * a0 + (c + y * y * d) * a1 + (y * z * d - x * s) * a2
+        pose[2, j] = (x * z * d - y * s) * a0 + (y * z * d + x * s) * a1 + (c + z * z * d) * a2
+        for i in range(3):
+            pose[i, j] += shift * (middle[i] + twist[3 + i])

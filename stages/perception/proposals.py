@@ -1,0 +1,167 @@
+"""Where the particles of one object come from: first guesses, diffusion and flips."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.perception.poses import (
+    compose,
+    cube_rotations,
+    exp_so3,
+    random_rotations,
+    rotate,
+    rotation_angle,
+    symmetry_angle,
+)
+from stages.scene.catalogue import CatalogueObject, Floats
+
+Dof = Literal[3, 6]
+_SAME = np.deg2rad(12.0)
+_RESTING = 0.5
+"""Share of the first guesses in which the object rests on the plane, where it need not."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What a candidate says of an object's pose."""
+
+    points: Floats
+    """N x 3 readings that may belong to it, camera frame, metres."""
+    T_camera_table: Floats
+
+
+class Proposals:
+    """Pose proposals for one catalogue object; poses are P x 3 x 4 rows of T_camera_object."""
+
+    def __init__(self, item: CatalogueObject, dof: Dof) -> None:
+        self.dof: Dof = dof
+        self._centre = item.bounds.mean(0)
+        self._vertices = item.simplified(500).vertices
+        # The catalogue's z axis is up when an object stands; resting poses of scanned meshes may lean a little.
+        self._resting = np.eye(3)[None] if dof == 3 else np.stack([np.eye(3), *item.resting])
+        self._symmetries = item.symmetries.transforms()
+        self._flips = self._distinct(np.concatenate([cube_rotations(), item.symmetries.near[:, :3, :3]]))
+
+    def initial(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
+        """First guesses: a reading inside the box is laid on the surface of the turned object."""
+        rotations, resting = self._rotations(guess, count, rng)
+        # In piles objects lie as they would on the plane, but on others.
+        resting &= (self.dof == 3) | (rng.random(count) < 0.5)
+        readings = guess.points[rng.integers(len(guess.points), size=count)]
+        facing = self._facing_points(rotations, readings, rng)
+        poses = np.concatenate([rotations, (readings - facing)[..., None]], -1)
+        return _put_down(poses, resting, self._vertices, guess.T_camera_table)
+
+    def uniform(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
+        """The paper's first guesses: any orientation, the centre at a reading inside the box."""
+        rotations, resting = self._rotations(guess, count, rng, resting_share=float(self.dof == 3))
+        readings = guess.points[rng.integers(len(guess.points), size=count)]
+        poses = np.concatenate([rotations, (readings - rotate(rotations, self._centre))[..., None]], -1)
+        return _put_down(poses, resting, self._vertices, guess.T_camera_table)
+
+    def directions(self, T_camera_table: Floats) -> Floats:
+        """The twists (rotation about the centre, translation; camera frame) the object may make, 6 x dof."""
+        if self.dof == 6:
+            return np.eye(6)
+        basis = np.zeros((6, 3))
+        basis[:3, 0] = T_camera_table[:3, 2]
+        basis[3:, 1] = T_camera_table[:3, 0]
+        basis[3:, 2] = T_camera_table[:3, 1]
+        return basis
+
+    def diffuse(
+        self, poses: Floats, directions: Floats, *, metres: float, radians: float, rng: np.random.Generator
+    ) -> Floats:
+        """Zero-mean Gaussian noise in every direction of freedom: the transition of Iterated Likelihood Weighting."""
+        turning = np.abs(directions[:3]).sum(0) > 0
+        steps = rng.normal(size=(len(poses), directions.shape[1])) * np.where(turning, radians, metres)
+        twists = (directions[None] * steps[:, None, :]).sum(-1)
+        return self._turned(poses, exp_so3(twists[:, :3]), twists[:, 3:])
+
+    def flipped(self, poses: Floats, T_camera_table: Floats, rng: np.random.Generator) -> Floats:
+        """One flip each, drawn among those that the object's symmetries do not undo; with six degrees of freedom
+        every second one is a turn by any angle about one of the object's axes."""
+        flips = self._flip_turns(poses, T_camera_table)
+        chosen = flips[np.arange(len(poses)), rng.integers(flips.shape[1], size=len(poses))]
+        if self.dof == 6:
+            axes = poses[np.arange(len(poses)), :, rng.integers(3, size=len(poses))]
+            turns = exp_so3(axes * rng.uniform(-np.pi, np.pi, (len(poses), 1)))
+            chosen = np.where((np.arange(len(poses)) % 2 == 0)[:, None, None], chosen, turns)
+        return self._turned(poses, chosen, np.zeros(3))
+
+    def all_flips(self, pose: Floats, T_camera_table: Floats) -> Floats:
+        """Every flip of one pose, itself first, F x 3 x 4."""
+        flips = self._flip_turns(pose[None], T_camera_table)[0]
+        repeated = np.repeat(pose[None], len(flips), 0)
+        return np.concatenate([pose[None], self._turned(repeated, flips, np.zeros(3))])
+
+    def _flip_turns(self, poses: Floats, T_camera_table: Floats) -> Floats:
+        """Rotations in the camera frame that flip each pose, P x F x 3 x 3."""
+        if self.dof == 3:
+            yaws = np.arange(1, 12) * (np.pi / 6)
+            turns = exp_so3(yaws[:, None] * T_camera_table[:3, 2])
+            return np.broadcast_to(turns, (len(poses), *turns.shape))
+        R = poses[:, None, :, :3]
+        return compose(compose(R, self._flips[None]), np.swapaxes(R, -1, -2))
+
+    def _turned(self, poses: Floats, turns: Floats, shifts: Floats) -> Floats:
+        """Poses after a turn about the object's centre and a shift, both in the camera frame."""
+        rotations = compose(turns, poses[..., :3])
+        centres = poses[..., 3] + rotate(poses[..., :3], self._centre) + shifts
+        return np.concatenate([rotations, (centres - rotate(rotations, self._centre))[..., None]], -1)
+
+    def _distinct(self, rotations: Floats) -> Floats:
+        """Rotations that are neither a symmetry nor, modulo symmetry, equal to an earlier one."""
+        kept: list[Floats] = []
+        for R in rotations:
+            known = [np.eye(3), *kept]
+            if all(symmetry_angle(other, R, self._symmetries) > _SAME for other in known):
+                kept.append(R)
+        return np.stack(kept) if kept else exp_so3(np.pi * np.eye(3)[:1])
+
+    def _rotations(
+        self, guess: Guess, count: int, rng: np.random.Generator, *, resting_share: float = _RESTING
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Orientations in the camera frame, and which of them rest on the plane."""
+        resting = np.ones(count, bool) if self.dof == 3 else rng.random(count) < resting_share
+        yaw = exp_so3(rng.uniform(-np.pi, np.pi, count)[:, None] * np.array([0.0, 0.0, 1.0]))
+        lying = compose(yaw, self._resting[rng.integers(len(self._resting), size=count)])
+        lying = compose(guess.T_camera_table[:3, :3], lying)
+        return np.where(resting[:, None, None], lying, random_rotations(count, rng)), resting
+
+    def _facing_points(self, rotations: Floats, readings: Floats, rng: np.random.Generator) -> Floats:
+        """For each rotation a random vertex on the side that faces the camera, camera axes, P x 3."""
+        chosen = self._vertices[rng.integers(len(self._vertices), size=(len(rotations), 4))]
+        turned = (rotations[:, None] * (chosen - self._centre)[:, :, None, :]).sum(-1)
+        along = (turned * readings[:, None]).sum(-1)
+        nearest = turned[np.arange(len(turned)), np.argmin(along, 1)]
+        return nearest + rotate(rotations, self._centre)
+
+
+def _put_down(poses: Floats, resting: NDArray[np.bool_], vertices: Floats, T_camera_table: Floats) -> Floats:
+    """Lifts or lowers poses until the lowest vertex touches the plane, where ``resting``."""
+    normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
+    slopes = (poses[:, :, :3] * normal[:, None]).sum(1)
+    lowest = (slopes[:, None, :] * vertices[None]).sum(-1).min(1)
+    height = lowest + ((poses[:, :, 3] - origin) * normal).sum(1)
+    put = poses.copy()
+    put[:, :, 3] -= np.where(resting, height, 0.0)[:, None] * normal
+    return put
+
+
+def distinct_best(poses: Floats, costs: Floats, count: int, *, metres: float, radians: float) -> NDArray[np.intp]:
+    """Indices of up to ``count`` cheap poses, best first, no two of which are close in both position and angle."""
+    kept: list[int] = []
+    for i in np.argsort(costs, kind="stable"):
+        near = poses[kept]
+        apart = np.sqrt(((near[:, :, 3] - poses[i, :, 3]) ** 2).sum(1)) > metres
+        apart |= rotation_angle(near[:, :, :3], poses[i, :, :3]) > radians
+        if bool(apart.all()):
+            kept.append(int(i))
+        if len(kept) == count:
+            break
+    return np.asarray(kept, np.intp)

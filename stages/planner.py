@@ -1,0 +1,240 @@
+"""Current scene and goal in, plan out: transfers with poses that would do, or the reason why there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from runner.contract import Refused, Stage
+from stages.messages import Assertion, Plan, Task, Transfer
+from stages.planning import search
+from stages.planning.pddl import DOMAIN, problem_pddl
+from stages.planning.placements import Placements, Scene
+from stages.planning.problem import TABLE, Problem, carriers, cycle
+from stages.planning.search import Solution, Step
+from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
+from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.standing import Stances
+from stages.scene.virtual import satisfied
+
+
+class Impossible(Exception):
+    """No plan reaches the goal; the text says why and names the objects."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A plan in the making: what has to be moved out of the way, and what should be placed late."""
+
+    problem: Problem
+    reluctant: frozenset[str]
+    avoided: frozenset[str]
+    """Keys of transfers that failed before."""
+
+    def after(self, blocked: Blocked, steps: Sequence[Step]) -> Attempt | None:
+        """The attempt that makes room for a step, or None where nothing is left to try.
+
+        What stands in the way is moved first, or placed later if the plan itself put it there. A region without
+        room may have it elsewhere: then the object that has the region is moved first.
+        """
+        step, problem = blocked.step, self.problem
+        earlier = {before.item for before in steps[: steps.index(step)]}
+        parent = (problem.regions[step.item].parent,) if step.region else ()
+        movable = set(blocked.obstacles) <= problem.graspable
+        for names in (blocked.obstacles if movable else (), parent):
+            placed = set(names) & earlier
+            if placed - self.reluctant:
+                return replace(self, reluctant=self.reluctant | placed)
+            added = {(name, step.item, step.destination) for name in set(names) & problem.graspable - earlier}
+            if added - problem.obstructions:
+                return replace(self, problem=replace(problem, obstructions=problem.obstructions | added))
+        return None
+
+
+class Planner(Stage):
+    """Plans at the level of the scene graph, then finds poses for every transfer of the plan."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """What to plan with, and where the robot can place."""
+
+        catalogue: str
+        engine: str = search.BFS
+        """``bfs``, or the name of an installed unified-planning engine."""
+        gripper_width: float = 0.095
+        """Widest object the gripper takes between its fingers, metres."""
+        workspace: Workspace = field(default_factory=Workspace)
+
+        def __post_init__(self) -> None:
+            """Refuses a gripper that does not open."""
+            if not self.gripper_width > 0:
+                raise Refused(f"planner.gripper_width={self.gripper_width}: must be a positive number of metres")
+
+    def __init__(self, config: Config) -> None:
+        search.check_engine(config.engine)
+        self._config = config
+        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
+
+    def on_task(self, task: Task) -> Plan:
+        """A plan whose every transfer has poses, or a refusal before anything moves."""
+        missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
+        if missing:
+            return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
+        held, violated = satisfied(task.goal, task.current, self._catalogue)
+        problem = self._problem(task, held)
+        text = problem_pddl(task.goal_name, problem, task.current, task.goal)
+        if not violated:
+            return _answer("satisfied", text)
+        try:
+            self._check(problem, task)
+            return self._solve_with_room(problem, task)
+        except Impossible as reason:
+            return _answer("refused", text, reason=str(reason))
+
+    def _problem(self, task: Task, held: Sequence[Assertion]) -> Problem:
+        regions = {item.name for item in task.goal.virtual_objects}
+        inside = (item.arguments for item in held if item.predicate == "in")
+        return Problem.between(
+            task.current,
+            task.goal,
+            held=frozenset(child for region, child in inside if region in regions),
+            graspable=frozenset(item.name for item in task.current.objects if not self._why_not(item.label)),
+        )
+
+    def _why_not(self, label: str) -> str:
+        """Why the robot cannot grasp an object; empty where it can."""
+        grasps = self._catalogue[label].grasps
+        if not grasps:
+            return "has no grasp in the catalogue"
+        narrowest = min(grasp.width for grasp in grasps)
+        if narrowest <= self._config.gripper_width:
+            return ""
+        return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * self._config.gripper_width:.1f} cm"
+
+    def _check(self, problem: Problem, task: Task) -> None:
+        """Raises :class:`Impossible` for goals that no search needs to look at."""
+        if problem.satisfied():
+            raise Impossible("no transfer changes what is violated: every object is where the goal has it")
+        if circle := cycle(problem.goal):
+            raise Impossible(f"in the goal {_listed(circle, sort=False)} rest on each other in a circle")
+        labels = {item.name: item.label for item in task.current.objects}
+        fixed = [item for item in problem.items if item not in problem.graspable]
+        for item in fixed:
+            support, wanted = problem.supports[item], problem.goal.get(item)
+            why = self._why_not(labels[item])
+            if wanted not in (None, support):
+                raise Impossible(f"{item} would have to move from {support} to {wanted}, but it {why}")
+            if item in problem.regions and item not in problem.held:
+                raise Impossible(f"{item} would have to move beside {problem.regions[item].parent}, but it {why}")
+            if support in problem.clear or problem.goal.get(support, TABLE) != problem.supports.get(support, TABLE):
+                raise Impossible(f"{item} on {support} would have to move, but it {why}")
+
+    def _solve_with_room(self, problem: Problem, task: Task) -> Plan:
+        """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
+        scene = Scene.of(task.current, self._stances)
+        beside = {
+            (neighbour, item, destination)
+            for item, destination in (_moved(key) for key in task.avoid)
+            for neighbour in neighbours(item, scene)[:1]
+            if neighbour in problem.graspable
+        }
+        if beside:
+            with suppress(Impossible):
+                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task)
+        return self._solve(problem, task)
+
+    def _solve(self, problem: Problem, task: Task) -> Plan:
+        """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
+        current = Scene.of(task.current, self._stances)
+        targets = Targets(Placements(task.goal, self._stances), self._config.workspace)
+        avoided = frozenset(task.avoid)
+        attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
+        while True:
+            text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
+            solution = self._search(attempt, text)
+            if solution.steps is None:
+                raise Impossible(_dead_end(attempt.problem, problem))
+            again = [step for step in solution.steps if _key(step) in avoided]
+            poses = targets.of(solution.steps, current, carriers(task.goal), again=again, late=attempt.reluctant)
+            if isinstance(poses, Crowded):
+                attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
+                continue
+            if not isinstance(poses, Blocked):
+                transfers = [_transfer(*pair, attempt.problem) for pair in zip(solution.steps, poses, strict=True)]
+                return _answer("solved", text, transfers=transfers, expanded=solution.expanded)
+            following = attempt.after(poses, solution.steps)
+            if following is None:
+                raise Impossible(_no_room(poses))
+            attempt = following
+
+    def _search(self, attempt: Attempt, text: str) -> Solution:
+        if self._config.engine == search.BFS:
+            return search.breadth_first(attempt.problem, reluctant=attempt.reluctant)
+        return search.with_engine(self._config.engine, text, attempt.problem)
+
+
+def _transfer(step: Step, T_base_targets: Floats, problem: Problem) -> Transfer:
+    pick, place = search.actions(step, problem)
+    return Transfer(
+        object=step.item,
+        source=step.source,
+        destination=step.destination,
+        T_base_targets=T_base_targets,
+        pick=pick,
+        place=place,
+    )
+
+
+def _answer(
+    status: Literal["satisfied", "solved", "refused"],
+    problem: str,
+    *,
+    reason: str = "",
+    transfers: Sequence[Transfer] = (),
+    expanded: int = 0,
+) -> Plan:
+    return Plan(
+        status=status,
+        reason=reason,
+        transfers=tuple(transfers),
+        actions=tuple(action for transfer in transfers for action in (transfer.pick, transfer.place)),
+        domain_pddl=DOMAIN,
+        problem_pddl=problem,
+        expanded=expanded,
+    )
+
+
+def _key(step: Step) -> str:
+    """The key that the step's transfer has."""
+    return f"{step.item}: {step.source} -> {step.destination}"
+
+
+def _moved(key: str) -> tuple[str, str]:
+    """Object and destination of a transfer's key."""
+    item, _, way = key.partition(": ")
+    return item, way.partition(" -> ")[2]
+
+
+def _dead_end(attempted: Problem, original: Problem) -> str:
+    added = attempted.obstructions - original.obstructions
+    if added:
+        obstacles = {obstacle for obstacle, _, _ in added}
+        return f"{_listed(obstacles)} would have to make room and cannot"
+    moving = {item for item, support in original.goal.items() if original.supports[item] != support}
+    fixed = {item for item in original.items if item not in original.graspable}
+    return f"no sequence of transfers moves {_listed(moving)} while {_listed(fixed) or 'nothing'} cannot be moved"
+
+
+def _no_room(blocked: Blocked) -> str:
+    step = blocked.step
+    where = f"on the table for {step.item}" if step.destination == TABLE else f"for {step.item} at {step.destination}"
+    because = f": {_listed(blocked.obstacles)} in the way" if blocked.obstacles else ""
+    return f"no room {where} within reach{because}"
+
+
+def _listed(names: Iterable[str], *, sort: bool = True) -> str:
+    return ", ".join(sorted(names) if sort else names)

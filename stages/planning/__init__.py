@@ -1,0 +1,1 @@
+"""PDDL, search, grasps and motion."""

@@ -1,0 +1,219 @@
+"""The world as planning sees it: the robot among estimated objects, checked for collisions with a clearance."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from stages.perception.poses import pose
+from stages.planning.robot import RobotModel
+from stages.scene.catalogue import CatalogueObject, Floats, Primitive
+
+AMPLE = 0.015
+"""Metres that motions far from what is grasped and placed keep from everything, where there is room."""
+
+_ROBOT, _NEAR_ROBOT, _NEAR_HELD, _HELD = 1, 2, 4, 8
+"""Contact bits: what the robot, what keeps clear of it, what keeps clear of the held object, the held object."""
+_HAND = ("wrist_flex_link", "wrist_roll_link", "gripper_link", "r_gripper_finger_link", "l_gripper_finger_link")
+"""Links that may come near the held object."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table top: a slab whose upper face is horizontal; metres, robot base frame."""
+
+    center: tuple[float, float]
+    size: tuple[float, float]
+    height: float
+    thickness: float = 0.04
+
+
+def add_table(spec: Any, table: Table) -> Any:
+    """Adds the table to a MuJoCo specification as body ``table``; returns its geom."""
+    body = spec.worldbody.add_body(name="table", pos=[*table.center, table.height - table.thickness / 2])
+    half = [table.size[0] / 2, table.size[1] / 2, table.thickness / 2]
+    return body.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=half)
+
+
+def add_primitives(body: Any, primitives: tuple[Primitive, ...]) -> list[Any]:
+    """Adds collision geometry in the object frame to a MuJoCo body; returns the geoms."""
+    return [_add_primitive(body, primitive) for primitive in primitives]
+
+
+def quaternion(R: Floats) -> Floats:
+    """Unit quaternion (w, x, y, z) of a 3 x 3 rotation."""
+    result = np.zeros(4)
+    mujoco.mju_mat2Quat(result, np.ascontiguousarray(R).ravel())
+    return result
+
+
+class CollisionWorld:
+    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried.
+
+    The hand frame is the catalogue's grasp frame: x is the approach direction, y the closing direction, the origin
+    lies between the fingertips. ``clearance`` (metres, at most :data:`AMPLE`) is kept from everything except what
+    :meth:`touching` and :meth:`resting` allow.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        table: Table,
+        objects: Mapping[str, tuple[CatalogueObject, Floats]],
+        *,
+        carried: str,
+        clearance: float = 0.005,
+    ) -> None:
+        self.robot, self.carried, self.checks = robot, carried, 0
+        self._model = self._compile(table, objects)
+        self._data = mujoco.MjData(self._model)
+        self._index_robot()
+        self._geoms = {name: self._geoms_of(name) for name in ("table", *objects)}
+        self._held_geoms = self._geoms_of("held")
+        self._obstacles = [geom for geoms in self._geoms.values() for geom in geoms]
+        self._model.geom_margin[self._obstacles] = clearance
+        self.set_width(robot.gripper.open_width)
+
+    def set_width(self, width: float) -> None:
+        """Opens the fingers to ``width`` metres for all checks that follow."""
+        self._data.qpos[self._fingers] = self.robot.gripper.finger(width)
+
+    def hand(self, q: Floats) -> Floats:
+        """Forward kinematics: T_base_hand (4 x 4) at joint positions ``q`` (J)."""
+        self._data.qpos[self._q] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        return pose(self._data.xmat[self._hand].reshape(3, 3), self._data.xpos[self._hand])
+
+    def jacobian(self) -> Floats:
+        """6 x J: linear then angular velocity of the hand in the base frame, at the last :meth:`hand`."""
+        mujoco.mj_comPos(self._model, self._data)
+        linear, angular = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
+        mujoco.mj_jacBody(self._model, self._data, linear, angular, self._hand)
+        return np.vstack([linear[:, self._v], angular[:, self._v]])
+
+    def is_free(self, q: Floats) -> bool:
+        """True where joint positions ``q`` (J) keep the clearance."""
+        self.checks += 1
+        self._data.qpos[self._q] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_collision(self._model, self._data)
+        return self._data.ncon == 0
+
+    def contacts(self, q: Floats) -> set[tuple[str, str]]:
+        """Pairs of bodies, each in alphabetical order, that are too close at ``q``, for messages to people."""
+        self.is_free(q)
+        found: set[tuple[str, str]] = set()
+        for contact in self._data.contact[: self._data.ncon]:
+            bodies = self._model.geom_bodyid[[contact.geom1, contact.geom2]]
+            first, second = sorted(self._model.body(body).name for body in bodies)
+            found.add((first, second))
+        return found
+
+    @contextmanager
+    def ample(self) -> Generator[None, None, None]:
+        """While it lasts, the clearance is :data:`AMPLE`."""
+        before = self._model.geom_margin[self._obstacles].copy()
+        self._model.geom_margin[self._obstacles] = AMPLE
+        try:
+            yield
+        finally:
+            self._model.geom_margin[self._obstacles] = before
+
+    @contextmanager
+    def touching(self, name: str) -> Generator[None, None, None]:
+        """While it lasts, robot and held object may touch ``name``."""
+        with self._without(self._geoms[name], _NEAR_ROBOT | _NEAR_HELD):
+            yield
+
+    @contextmanager
+    def resting(self, *names: str) -> Generator[None, None, None]:
+        """While it lasts, the held object, not the robot, may touch ``names``."""
+        with self._without([g for name in names for g in self._geoms[name]], _NEAR_HELD):
+            yield
+
+    @contextmanager
+    def holding(self, T_hand_object: Floats, width: float) -> Generator[None, None, None]:
+        """While it lasts, the carried object is in the hand and no longer where it was perceived."""
+        body = self._model.body("held").id
+        self._model.body_pos[body], self._model.body_quat[body] = (
+            T_hand_object[:3, 3],
+            quaternion(T_hand_object[:3, :3]),
+        )
+        self._set_held(_HELD, _NEAR_HELD)
+        self.set_width(width)
+        try:
+            with self.touching(self.carried):
+                yield
+        finally:
+            self._set_held(0, 0)
+            self.set_width(self.robot.gripper.open_width)
+
+    def move(self, T_base_object: Floats) -> None:
+        """Says that the carried object now stands at ``T_base_object``."""
+        mocap = self._model.body_mocapid[self._model.body(self.carried).id]
+        self._data.mocap_pos[mocap] = T_base_object[:3, 3]
+        self._data.mocap_quat[mocap] = quaternion(T_base_object[:3, :3])
+
+    def _set_held(self, contype: int, conaffinity: int) -> None:
+        body = self._model.body("held").id
+        self._model.geom_contype[self._held_geoms], self._model.geom_conaffinity[self._held_geoms] = (
+            contype,
+            conaffinity,
+        )
+        # MuJoCo's broad phase reads the bits of whole bodies.
+        self._model.body_contype[body], self._model.body_conaffinity[body] = contype, conaffinity
+
+    @contextmanager
+    def _without(self, geoms: list[int], bits: int) -> Generator[None, None, None]:
+        before = self._model.geom_contype[geoms].copy()
+        self._model.geom_contype[geoms] = before & ~bits
+        try:
+            yield
+        finally:
+            self._model.geom_contype[geoms] = before
+
+    def _compile(self, table: Table, objects: Mapping[str, tuple[CatalogueObject, Floats]]) -> Any:
+        spec = self.robot.specification()
+        for geom in spec.geoms:
+            near_hand = 0 if geom.parent.name in _HAND else _HELD
+            geom.contype, geom.conaffinity = _ROBOT, _ROBOT | _NEAR_ROBOT | near_hand
+        obstacles = [add_table(spec, table)]
+        for name, (entry, T) in objects.items():
+            body = spec.worldbody.add_body(name=name, mocap=True, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
+            obstacles += add_primitives(body, entry.collision)
+        for geom in obstacles:
+            geom.contype, geom.conaffinity, geom.margin = _NEAR_ROBOT | _NEAR_HELD, 0, AMPLE
+        gripper = self.robot.gripper
+        hand = spec.body(gripper.link).add_body(name="hand", pos=[gripper.reach, 0, 0])
+        for geom in add_primitives(hand.add_body(name="held"), objects[self.carried][0].collision):
+            geom.contype, geom.conaffinity, geom.mass = 0, 0, 1e-6
+        return spec.compile()
+
+    def _index_robot(self) -> None:
+        model, joints = self._model, [self._model.joint(name) for name in self.robot.joints]
+        self._q = np.array([joint.qposadr[0] for joint in joints])
+        self._v = np.array([joint.dofadr[0] for joint in joints])
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.gripper.joints])
+        self._hand = model.body("hand").id
+        # A joint without limits turns freely; half a turn either way reaches every angle.
+        limits = [model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.pi, np.pi) for j in joints]
+        self.lower, self.upper = np.array(limits).T
+        for name, position in self.robot.head.items():
+            self._data.joint(name).qpos[0] = position
+
+    def _geoms_of(self, body: str) -> list[int]:
+        return [int(geom) for geom in np.flatnonzero(self._model.geom_bodyid == self._model.body(body).id)]
+
+
+def _add_primitive(body: Any, primitive: Primitive) -> Any:
+    T = primitive.T_object_primitive
+    placed: dict[str, Any] = {"pos": T[:3, 3], "quat": quaternion(T[:3, :3])}
+    if primitive.kind == "box":
+        return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=np.array(primitive.size) / 2, **placed)
+    radius, height = primitive.size
+    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[radius, height / 2, 0], **placed)

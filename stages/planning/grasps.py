@@ -1,0 +1,76 @@
+"""From the catalogue's grasps to hand poses: the same grasp seen through the symmetries of the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.scene.catalogue import CatalogueObject, Floats, Grasp
+
+_STEP = np.deg2rad(22.5)
+"""How finely a continuous symmetry is sampled."""
+_STEEPEST = 0.2
+"""Largest vertical component of an approach direction: nothing is grasped from below."""
+
+
+@dataclass(frozen=True)
+class HandPose:
+    """A hand pose at which the object is held with ``grasp``."""
+
+    grasp: Grasp
+    T_base_hand: Floats
+    T_base_prehand: Floats
+    T_object_hand: Floats
+    """4 x 4; equals the catalogue's grasp up to a symmetry of the object."""
+
+
+def distinct_grasps(entry: CatalogueObject) -> list[Grasp]:
+    """The object's grasps in the user's order, without those that a symmetry turns into an earlier one."""
+    kept: list[Grasp] = []
+    seen: list[Floats] = []
+    for grasp in entry.grasps:
+        if not any(np.allclose(grasp.T_object_grasp, T, atol=1e-3) for T in seen):
+            kept.append(grasp)
+            seen += [pose.T_object_hand for pose in _all_poses(entry, grasp, np.eye(4))]
+    return kept
+
+
+def hand_poses(entry: CatalogueObject, grasp: Grasp, T_base_object: Floats) -> list[HandPose]:
+    """Every way to apply ``grasp`` to the object at ``T_base_object`` (4 x 4), most natural first.
+
+    Two hand poses of one object and grasp differ by a symmetry only: picked with one, the object may be placed
+    with any other. Approaches from below are left out; the others are ordered by how much they point away from
+    the robot, then as the symmetries come.
+    """
+    poses = [pose for pose in _all_poses(entry, grasp, T_base_object) if pose.T_base_hand[2, 0] <= _STEEPEST]
+    return _distinct(sorted(poses, key=lambda pose: -_outward(pose)))
+
+
+def _all_poses(entry: CatalogueObject, grasp: Grasp, T_base_object: Floats) -> list[HandPose]:
+    symmetries = entry.symmetries.transforms(_STEP)
+    return [_hand_pose(grasp, T_base_object, symmetry) for symmetry in symmetries]
+
+
+def _hand_pose(grasp: Grasp, T_base_object: Floats, symmetry: Floats) -> HandPose:
+    T_object_hand = symmetry @ grasp.T_object_grasp
+    return HandPose(
+        grasp=grasp,
+        T_base_hand=T_base_object @ T_object_hand,
+        T_base_prehand=T_base_object @ symmetry @ grasp.T_object_pregrasp,
+        T_object_hand=T_object_hand,
+    )
+
+
+def _outward(pose: HandPose) -> float:
+    """Horizontal part of the approach along the line from the robot to the object, rounded to keep ties in order."""
+    radial = pose.T_base_hand[:2, 3] / np.linalg.norm(pose.T_base_hand[:2, 3])
+    return round(float(radial @ pose.T_base_hand[:2, 0]), 2)
+
+
+def _distinct(poses: list[HandPose]) -> list[HandPose]:
+    kept: list[HandPose] = []
+    for pose in poses:
+        if not any(np.allclose(pose.T_base_hand, other.T_base_hand, atol=1e-3) for other in kept):
+            kept.append(pose)
+    return kept

@@ -1,0 +1,215 @@
+"""Collision-free motion: inverse kinematics, straight hand motions, RRT-Connect and time parameterisation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+import ompl.base as ob
+import ompl.geometric as og
+import ompl.util as ou
+import toppra
+from toppra.algorithm import TOPPRA
+from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
+
+from stages.perception.poses import pose
+from stages.planning.collision import CollisionWorld, quaternion
+from stages.planning.robot import RobotModel
+from stages.scene.catalogue import Floats
+
+POSITION_TOLERANCE = 5e-4
+"""Metres per axis at which inverse kinematics is content."""
+ROTATION_TOLERANCE = 3e-3
+"""Radians per axis at which inverse kinematics is content."""
+
+_DAMPING = 1e-4
+_LARGEST_STEP = 0.4
+"""Radians that one joint may move in one step of inverse kinematics."""
+_LARGEST_JUMP = 0.35
+"""Radians between waypoints of a straight hand motion; more means a change of configuration."""
+_STRAIGHT_STEP = 0.01
+"""Metres between waypoints of a straight hand motion."""
+_RESOLUTION = 0.02
+"""Largest joint motion between collision checks of a path, radians (metres)."""
+_CHECKS = 15_000
+"""Collision checks after which RRT-Connect gives up."""
+_SPLINE_STEP = 0.05
+"""Waypoints are densified to this joint distance, so that the spline stays on the checked straight edges."""
+_SAMPLE_TIME = 0.02
+
+ou.noOutputHandler()
+toppra.setup_logging("ERROR")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A timed joint motion: ``times`` (T) in seconds from 0, ``positions`` and ``velocities`` (T x J)."""
+
+    times: Floats
+    positions: Floats
+    velocities: Floats
+
+
+def solve_ik(
+    world: CollisionWorld, T_base_hand: Floats, *, seeds: Iterator[Floats], free: bool = True, iterations: int = 60
+) -> Floats | None:
+    """Joint positions (J) that put the hand at ``T_base_hand``, from the first seed that leads there.
+
+    Damped least squares within the joint limits (Wampler 1986). With ``free``, solutions must be collision-free.
+    """
+    for seed in seeds:
+        q = _descend(world, T_base_hand, seed, iterations)
+        if q is not None and (not free or world.is_free(q)):
+            return q
+    return None
+
+
+def restarts(world: CollisionWorld, rng: np.random.Generator, *first: Floats, extra: int) -> Iterator[Floats]:
+    """Seeds for :func:`solve_ik`: ``first``, then ``extra`` random postures within the joint limits."""
+    yield from first
+    for _ in range(extra):
+        yield rng.uniform(world.lower, world.upper)
+
+
+def straight_motion(world: CollisionWorld, start: Floats, T_base_hand: Floats, *, free: bool = True) -> Floats | None:
+    """Waypoints (W x J) that move the hand on a straight line from joint positions ``start`` to ``T_base_hand``.
+
+    None where the line leaves the joint limits, jumps between configurations or, with ``free``, collides.
+    """
+    waypoints = [start]
+    for T in _interpolate(world.hand(start), T_base_hand):
+        q = solve_ik(world, T, seeds=iter(waypoints[-1:]), free=free)
+        if q is None or np.abs(q - waypoints[-1]).max() > _LARGEST_JUMP:
+            return None
+        waypoints.append(q)
+    return np.array(waypoints)
+
+
+def free_motion(world: CollisionWorld, start: Floats, goal: Floats, rng: np.random.Generator) -> Floats | None:
+    """Waypoints (W x J) of a collision-free motion in joint space, with ample clearance where there is room for it.
+
+    None where none is found. The edges between waypoints are checked every ``_RESOLUTION``. Equal generators give
+    equal motions.
+    """
+    with world.ample():
+        path = _connect(world, start, goal, rng)
+    return _connect(world, start, goal, rng) if path is None else path
+
+
+def _connect(world: CollisionWorld, start: Floats, goal: Floats, rng: np.random.Generator) -> Floats | None:
+    """RRT-Connect (Kuffner 2000), then shortcuts."""
+    ou.RNG.setSeed(int(rng.integers(1, 2**31)))
+    if not (world.is_free(start) and world.is_free(goal)):
+        return None
+    setup = _simple_setup(world, start, goal)
+    budget = world.checks + _CHECKS
+    setup.solve(ob.PlannerTerminationCondition(lambda: world.checks > budget))
+    if not setup.haveExactSolutionPath():
+        return None
+    path = setup.getSolutionPath()
+    simplifier = og.PathSimplifier(setup.getSpaceInformation())
+    simplifier.reduceVertices(path, 30, 30)
+    simplifier.partialShortcutPath(path, 60, 40)
+    simplifier.reduceVertices(path, 30, 30)
+    return np.array([_array(path.getState(k), len(start)) for k in range(path.getStateCount())])
+
+
+def is_motion_free(world: CollisionWorld, waypoints: Floats, *, step: float = 0.01) -> bool:
+    """Checks the straight edges between ``waypoints`` (W x J) every ``step`` radians."""
+    return all(world.is_free(q) for q in densify(waypoints, step))
+
+
+def densify(waypoints: Floats, step: float) -> Floats:
+    """Inserts points so that no joint moves more than ``step`` between neighbours; repeated points are dropped."""
+    dense = [waypoints[0]]
+    for a, b in pairwise(waypoints):
+        distance = np.abs(b - a).max()
+        if distance > 1e-6:
+            pieces = int(np.ceil(distance / step))
+            dense += [a + (b - a) * i / pieces for i in range(1, pieces + 1)]
+    return np.array(dense)
+
+
+def time_parameterise(robot: RobotModel, waypoints: Floats, *, speed: float = 0.7) -> Trajectory:
+    """Fastest traversal of ``waypoints`` (W x J) within ``speed`` times the joint limits (TOPP-RA, Pham 2018)."""
+    points = densify(waypoints, _SPLINE_STEP)
+    if len(points) < 2:
+        return Trajectory(np.zeros(1), points, np.zeros_like(points))
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    # A clamped spline stands still at its ends, where the time optimal motion would then creep.
+    path = toppra.SplineInterpolator(arc, points, bc_type="natural")
+    velocity, acceleration = robot.velocity * speed, robot.acceleration * speed
+    limits = [
+        JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
+        JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
+    ]
+    grid = np.linspace(0, arc[-1], max(60, 4 * len(points)))
+    timed: Any = TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel").compute_trajectory(0, 0)
+    times = np.append(np.arange(0, timed.duration, _SAMPLE_TIME), timed.duration)
+    return Trajectory(times, timed(times), timed(times, 1))
+
+
+def _descend(world: CollisionWorld, target: Floats, seed: Floats, iterations: int) -> Floats | None:
+    q = np.clip(seed, world.lower, world.upper)
+    for _ in range(iterations):
+        error = _pose_error(world.hand(q), target)
+        if np.abs(error[:3]).max() < POSITION_TOLERANCE and np.abs(error[3:]).max() < ROTATION_TOLERANCE:
+            return q
+        J = world.jacobian()
+        step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
+        step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
+        q = np.clip(q + step, world.lower, world.upper)
+    return None
+
+
+def _pose_error(current: Floats, target: Floats) -> Floats:
+    """Twist (6) in the base frame that leads from ``current`` to ``target`` in unit time."""
+    rotation = np.zeros(3)
+    mujoco.mju_quat2Vel(rotation, quaternion(target[:3, :3] @ current[:3, :3].T), 1.0)
+    return np.concatenate([target[:3, 3] - current[:3, 3], rotation])
+
+
+def _interpolate(start: Floats, end: Floats) -> Iterator[Floats]:
+    """Poses after ``start`` up to ``end``: straight line, rotation about one axis."""
+    twist = _pose_error(start, end)
+    steps = max(2, int(np.ceil(np.linalg.norm(twist[:3]) / _STRAIGHT_STEP)))
+    for k in range(1, steps + 1):
+        turn, R = np.array([1.0, 0, 0, 0]), np.zeros(9)
+        mujoco.mju_quatIntegrate(turn, np.ascontiguousarray(twist[3:]), k / steps)
+        mujoco.mju_quat2Mat(R, turn)
+        yield pose(R.reshape(3, 3) @ start[:3, :3], start[:3, 3] + twist[:3] * k / steps)
+
+
+def _simple_setup(world: CollisionWorld, start: Floats, goal: Floats) -> Any:
+    joints = len(start)
+    space = ob.RealVectorStateSpace(joints)
+    bounds = ob.RealVectorBounds(joints)
+    for i in range(joints):
+        # Room for rounding: a start on a joint limit is valid.
+        bounds.setLow(i, float(world.lower[i]) - 1e-6)
+        bounds.setHigh(i, float(world.upper[i]) + 1e-6)
+    space.setBounds(bounds)
+    setup = og.SimpleSetup(space)
+    information = setup.getSpaceInformation()
+    setup.setStateValidityChecker(lambda state: world.is_free(_array(state, joints)))
+    information.setStateValidityCheckingResolution(_RESOLUTION / space.getMaximumExtent())
+    setup.setStartAndGoalStates(_state(information, start), _state(information, goal))
+    planner = og.RRTConnect(information)
+    planner.setRange(1.0)
+    setup.setPlanner(planner)
+    return setup
+
+
+def _state(information: Any, q: Floats) -> Any:
+    state = information.allocState()
+    for i, value in enumerate(q):
+        state[i] = float(value)
+    return state
+
+
+def _array(state: Any, joints: int) -> Floats:
+    return np.array([cast(float, state[i]) for i in range(joints)])

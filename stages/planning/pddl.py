@@ -1,0 +1,169 @@
+"""Scenes and tasks as PDDL that any planner reads; every pose label is tied to a pose in the robot's base frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.messages.scene import SceneGraph
+from stages.planning.problem import TABLE, Problem
+from stages.scene.catalogue import Floats
+
+DOMAIN = """\
+; Picking and placing on a table. Items rest on convex items and on the table, and in concave items.
+(define (domain scene)
+  (:requirements :adl)
+  (:types
+    support region - thing      ; the table, items, and regions attached to items
+    item - support
+    label)                      ; names a pose in the robot's base frame
+  (:constants table - support)
+  (:predicates
+    (exist ?i - item)
+    (clear ?s - support)                          ; nothing is on or in it
+    (on ?i - item ?s - support)
+    (in ?t - thing ?s - support)                  ; an item in a container, or a region in which its child is
+    (has ?p - item ?r - region)                   ; the region is attached to the item's frame
+    (at ?i - item ?l - label)                     ; perceived there, and not touched since
+    (holding ?i - item)
+    (handempty)
+    (graspable ?i - item)
+    (concave ?s - support)
+    (roomy ?s - support)                          ; may carry several items; geometry says whether one more fits
+    (may-rest ?i - item ?s - support)             ; worth trying
+    (belongs ?i - item ?r - region)
+    (obstructs ?o - item ?i - item ?s - support)) ; it stands where the item would come on the support
+
+  (:action pick
+    :parameters (?i - item ?s - support)
+    :precondition (and (handempty) (exist ?i) (graspable ?i) (clear ?i) (on ?i ?s))
+    :effect (and (holding ?i) (not (handempty)) (not (on ?i ?s))
+      (when (forall (?o - item) (or (= ?o ?i) (not (on ?o ?s)))) (clear ?s))
+      (forall (?l - label) (not (at ?i ?l)))
+      (forall (?r - region) (not (in ?r ?i)))
+      (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
+      (forall (?o - item ?t - support) (not (obstructs ?i ?o ?t)))))
+
+  (:action pick-from
+    :parameters (?i - item ?s - item)
+    :precondition (and (handempty) (exist ?i) (graspable ?i) (clear ?i) (in ?i ?s))
+    :effect (and (holding ?i) (not (handempty)) (not (in ?i ?s))
+      (when (forall (?o - item) (or (= ?o ?i) (not (in ?o ?s)))) (clear ?s))
+      (forall (?l - label) (not (at ?i ?l)))
+      (forall (?r - region) (not (in ?r ?i)))
+      (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
+      (forall (?o - item ?t - support) (not (obstructs ?i ?o ?t)))))
+
+  (:action place-on
+    :parameters (?i - item ?s - support)
+    :precondition (and (holding ?i) (may-rest ?i ?s) (not (concave ?s)) (or (roomy ?s) (clear ?s))
+      (forall (?o - item) (not (obstructs ?o ?i ?s))))
+    :effect (and (on ?i ?s) (handempty) (not (holding ?i)) (not (clear ?s))))
+
+  (:action place-in
+    :parameters (?i - item ?s - item)
+    :precondition (and (holding ?i) (may-rest ?i ?s) (concave ?s)
+      (forall (?o - item) (not (obstructs ?o ?i ?s))))
+    :effect (and (in ?i ?s) (handempty) (not (holding ?i)) (not (clear ?s))))
+
+  (:action place-at-region
+    :parameters (?i - item ?r - region ?p - item ?s - support)
+    :precondition (and (holding ?i) (may-rest ?i ?s) (belongs ?i ?r) (has ?p ?r) (or (on ?p ?s) (in ?p ?s))
+      (or (roomy ?s) (clear ?s))
+      (forall (?o - item) (not (obstructs ?o ?i ?s))))
+    :effect (and (in ?r ?i) (handempty) (not (holding ?i)) (not (clear ?s))
+      (when (concave ?s) (in ?i ?s))
+      (when (not (concave ?s)) (on ?i ?s)))))
+"""
+
+
+def symbol(name: str) -> str:
+    """A name that PDDL accepts: lower case, letters first, no blanks."""
+    plain = re.sub(r"[^a-z0-9_-]", "_", name.lower())
+    return plain if plain[0].isalpha() else f"o_{plain}"
+
+
+def fact(predicate: str, *names: str) -> str:
+    """``(predicate name ...)``."""
+    return f"({' '.join([predicate, *map(symbol, names)])})"
+
+
+def pose_comments(scene: SceneGraph, prefix: str) -> list[str]:
+    """One comment for each object: its pose label and the pose in the base frame."""
+    return [f"; {symbol(prefix + item.name):24} {_pose(item.T_base_object)}" for item in scene.objects]
+
+
+def _pose(T: Floats) -> str:
+    position = " ".join(f"{value:.4f}" for value in T[:3, 3])
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True) + np.zeros(4)
+    return f"xyz {position} quaternion_xyzw {x:.4f} {y:.4f} {z:.4f} {w:.4f}"
+
+
+def goal_pddl(name: str, scene: SceneGraph) -> str:
+    """A demonstrated scene as a complete PDDL problem for :data:`DOMAIN`, solved already: start and goal are the scene.
+
+    Put another scene's facts in its ``:init``, and it is the task of restoring the demonstrated one.
+    """
+    children = frozenset(item.child for item in scene.virtual_objects)
+    problem = Problem.between(scene, scene, held=children, graspable=frozenset())
+    return problem_pddl(name, problem, scene, scene)
+
+
+def problem_pddl(name: str, problem: Problem, current: SceneGraph, goal: SceneGraph) -> str:
+    """The task as a PDDL problem for :data:`DOMAIN`."""
+    return "\n".join(
+        [
+            f"; From the scene {current.name!r} to the goal {name!r}: poses in the robot's base frame, metres.",
+            *pose_comments(current, "pos_"),
+            "; and in the goal scene",
+            *pose_comments(goal, "goal_"),
+            f"(define (problem {symbol(name)})",
+            "  (:domain scene)",
+            *_block("objects", _typed(problem.items, goal)),
+            *_block("init", _init(problem, goal)),
+            *_block("goal", ["(and", *(f"  {line}" for line in _goal(problem)), ")"]),
+            ")",
+            "",
+        ]
+    )
+
+
+def _block(name: str, lines: Iterable[str]) -> list[str]:
+    return [f"  (:{name}", *(f"    {line}" for line in lines), "  )"]
+
+
+def _typed(items: Sequence[str], goal: SceneGraph) -> list[str]:
+    regions = [item.name for item in goal.virtual_objects]
+    lists = {"item": items, "region": regions, "label": [f"pos_{item}" for item in items]}
+    return [f"{' '.join(map(symbol, names))} - {kind}" for kind, names in lists.items() if names]
+
+
+def _init(problem: Problem, goal: SceneGraph) -> list[str]:
+    occupied = set(problem.supports.values())
+    regions = problem.regions.values()
+    return [
+        "(handempty)",
+        *(fact("exist", item) for item in problem.items),
+        *(fact("at", item, f"pos_{item}") for item in problem.items),
+        *(fact("in" if s in problem.concave else "on", item, s) for item, s in problem.supports.items()),
+        *(fact("clear", item) for item in problem.items if item not in occupied),
+        *(fact("graspable", item) for item in problem.items if item in problem.graspable),
+        *(fact("concave", item) for item in problem.items if item in problem.concave),
+        *(fact("roomy", item) for item in (TABLE, *problem.items) if item in problem.roomy),
+        *(fact("may-rest", item, s) for item in problem.items for s in problem.destinations(item)),
+        *(fact("has", region.parent, region.name) for region in regions),
+        *(fact("belongs", region.child, region.name) for region in regions),
+        *(fact("in", region.name, region.child) for region in regions if region.child in problem.held),
+        *(fact("obstructs", *names) for names in sorted(problem.obstructions)),
+    ]
+
+
+def _goal(problem: Problem) -> list[str]:
+    return [
+        *(fact("in" if s in problem.concave else "on", item, s) for item, s in problem.goal.items()),
+        *(fact("clear", item) for item in sorted(problem.clear)),
+        *(fact("in", region.name, region.child) for region in problem.regions.values()),
+    ]

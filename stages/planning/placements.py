@@ -1,0 +1,194 @@
+"""Where an object could be placed so that the goal's relation holds: poses around the demonstrated one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stages.messages.scene import SceneGraph
+from stages.perception.poses import inverse
+from stages.planning.problem import TABLE, carriers
+from stages.planning.search import Step
+from stages.scene import regions
+from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.standing import ALIGNED, Stances, Standing, yawed
+from stages.scene.virtual import region_poses
+
+QUARTERS = 4
+RING = 24
+"""Most places around a symmetric parent."""
+TURNED = 0.03
+"""Cost of a quarter turn that the demonstration did not show, in metres of shift."""
+LAID = 0.05
+"""Cost of leaving the object lying (or standing) as it is where the demonstration shows it otherwise."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Objects in the table frame and what carries each: as perceived, or as they will be later in a plan."""
+
+    standing: Mapping[str, Standing]
+    supports: Mapping[str, str]
+    T_base_table: Floats
+
+    @staticmethod
+    def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
+        """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy."""
+        T_table_base = inverse(graph.T_base_table)
+        standing = {
+            item.name: Standing.at(item.name, stances[item.label], T_table_base @ item.T_base_object)
+            for item in graph.objects
+        }
+        scene = Scene({}, carriers(graph), graph.T_base_table)
+        while standing:
+            name = next(name for name in standing if scene.supports[name] not in standing)
+            item = standing.pop(name)
+            scene = scene.after(name, scene.rested(item, scene.supports[name]), scene.supports[name])
+        return scene
+
+    def rested(self, item: Standing, support: str) -> Standing:
+        """The object at the height at which its bottom meets the surface below it; one that leans stays."""
+        if not item.stance.aligned:
+            return item
+        surface = 0.0 if support == TABLE else self.standing[support].rest_height(item.bottom)
+        T = item.T_table_stance.copy()
+        T[2, 3] = surface - item.stance.low
+        return replace(item, T_table_stance=T)
+
+    def after(self, name: str, item: Standing, support: str) -> Scene:
+        """The scene once an object stands elsewhere."""
+        return replace(self, standing={**self.standing, name: item}, supports={**self.supports, name: support})
+
+    def others(self, name: str, support: str) -> list[Standing]:
+        """Everything but the object and what carries it."""
+        chain = {name}
+        while support in self.supports:
+            chain.add(support)
+            support = self.supports[support]
+        return [item for item in self.standing.values() if item.name not in chain]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A pose to consider and how far it is from the demonstration, metres."""
+
+    standing: Standing
+    cost: float
+
+
+class Placements:
+    """Placements of one step, best first."""
+
+    def __init__(self, goal: SceneGraph, stances: Mapping[str, Stances]) -> None:
+        self._goal = Scene.of(goal, stances)
+        self._labels = {item.name: item.label for item in goal.objects}
+        self._poses = {item.name: item.T_base_object for item in goal.objects}
+        self._virtual = {item.name: item for item in goal.virtual_objects}
+        self._stances = stances
+
+    def of(self, step: Step, scene: Scene) -> list[Placement]:
+        """All placements of a step of the goal, in the table frame; their height is still to be found."""
+        item = scene.standing[step.item]
+        stances = self._stances[self._labels[step.item]]
+        nominal = self._nominal(step, scene)
+        shifts = list(self._shifts(step, scene))
+        made: list[Placement] = []
+        for k, T in enumerate(nominal):
+            away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
+            for turned, cost in _orientations(T, item):
+                base = Standing.at(step.item, stances, turned)
+                near = shifts if k == 0 and cost < TURNED else shifts[:13]
+                made += [Placement(_shifted(base, shift), away + cost + float(np.hypot(*shift))) for shift in near]
+        return sorted(made, key=lambda placement: placement.cost)
+
+    def reserved(self, pending: Sequence[Step], scene: Scene) -> list[Standing]:
+        """Where the objects of steps still to come will stand on the table, as demonstrated."""
+        steps = [step for step in pending if step.destination == TABLE and step.item in self._poses]
+        nominal = ((step, self._nominal(step, scene)) for step in steps)
+        return [
+            Standing.at(step.item, self._stances[self._labels[step.item]], poses[0]) for step, poses in nominal if poses
+        ]
+
+    def _nominal(self, step: Step, scene: Scene) -> list[Floats]:
+        """Demonstrated poses in the table frame of this scene, modulo the symmetries of what they are relative to."""
+        if step.region:
+            virtual = self._virtual[step.region]
+            parent = scene.standing[virtual.parent]
+            poses = region_poses(virtual, parent.T_table_object, parent.stance.item.symmetries)
+        elif step.destination == TABLE:
+            return [inverse(scene.T_base_table) @ self._poses[step.item]]
+        else:
+            support = scene.standing[step.destination]
+            relative = inverse(self._goal.standing[step.destination].T_table_object) @ self._shown(step.item)
+            poses = support.T_table_object @ support.stance.item.symmetries.transforms(np.pi / 8) @ relative
+        upright = poses[:, 2, :3] @ self._shown(step.item)[2, :3] > np.cos(ALIGNED)
+        kept = list(poses[upright])
+        return kept[:: -(-len(kept) // RING)] if kept else [self._centred(step, scene)]
+
+    def _shown(self, name: str) -> Floats:
+        """The pose in the goal scene's table frame."""
+        return self._goal.standing[name].T_table_object
+
+    def _centred(self, step: Step, scene: Scene) -> Floats:
+        """The middle of the support, where it now stands so that the demonstrated relative pose means nothing."""
+        T = self._shown(step.item).copy()
+        carrier = scene.standing.get(step.destination)
+        T[:2, 3] = regions.centroid(carrier.top) if carrier else scene.standing[step.item].T_table_object[:2, 3]
+        return T
+
+    def _shifts(self, step: Step, scene: Scene) -> Iterator[tuple[float, float]]:
+        """Horizontal shifts, smallest first: as far as the relation allows, in steps of a centimetre at first."""
+        if step.region:
+            reach, pitch = 0.6 * self._virtual[step.region].radius, 0.008
+        elif step.destination == TABLE:
+            reach, pitch = 0.3, 0.01
+        else:
+            size = np.ptp(scene.standing[step.destination].outline, axis=0)
+            reach, pitch = 0.5 * float(size.max()), 0.01
+        yield from spiral(pitch, min(reach, 0.04))
+        yield from (shift for shift in spiral(0.03, reach) if np.hypot(*shift) > 0.04)
+
+
+def spiral(pitch: float, reach: float) -> list[tuple[float, float]]:
+    """Points of a square grid within a disc, from its centre outwards; the first 13 lie within two steps."""
+    count = int(reach / pitch + 1e-9)
+    steps = range(-count, count + 1)
+    points = [(pitch * i, pitch * j) for i in steps for j in steps if pitch * np.hypot(i, j) <= reach + 1e-9]
+    return sorted(points, key=lambda point: (round(float(np.hypot(*point)), 9), point))
+
+
+def _shifted(item: Standing, shift: tuple[float, float]) -> Standing:
+    return replace(item, T_table_stance=yawed(0.0, np.array([*shift, 0.0])) @ item.T_table_stance)
+
+
+def _orientations(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
+    """Ways to turn an object at a demonstrated pose, with their cost.
+
+    First those that look the same and keep the side up that is up now, so that nobody has to turn it over; where
+    there is none it has to be laid down or put upright, or may stay as it is.
+    """
+    up = item.T_table_object[2, :3]
+    alike = [T @ S for S in _lookalikes(item.stance.item)]
+    kept = [turned for turned in alike if turned[2, :3] @ up > np.cos(ALIGNED)]
+    found = [(turned, 0.002 * k) for k, turned in enumerate(kept or [T])]
+    if not kept:
+        as_it_is = T.copy()
+        as_it_is[:3, :3] = item.T_table_object[:3, :3]
+        found.append((as_it_is, LAID))
+    quarters = (yawed(2 * np.pi * k / QUARTERS, np.zeros(3))[:3, :3] for k in range(1, QUARTERS))
+    return found + [(_turned(found[0][0], R), TURNED + 0.002 * k) for k, R in enumerate(quarters)]
+
+
+def _turned(T: Floats, R: Floats) -> Floats:
+    result = T.copy()
+    result[:3, :3] = R @ T[:3, :3]
+    return result
+
+
+def _lookalikes(item: CatalogueObject) -> Floats:
+    """Symmetries, then near symmetries, of an object; continuous ones in quarter turns."""
+    exact = item.symmetries.transforms(2 * np.pi / QUARTERS)
+    near = item.symmetries.near.reshape(-1, 4, 4)
+    return np.concatenate([exact, (near[:, None] @ exact[None]).reshape(-1, 4, 4)])

@@ -1,0 +1,187 @@
+"""Finding the order of transfers: breadth-first search, or any engine of unified-planning over the same PDDL."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+from runner.contract import Refused
+from stages.planning.pddl import DOMAIN, fact, symbol
+from stages.planning.problem import TABLE, Problem
+
+BFS = "bfs"
+"""The engine that is always there: :func:`breadth_first`."""
+State = tuple[tuple[str, ...], frozenset[str], frozenset[tuple[str, str, str]]]
+"""Support of each item, children in their region, obstructions that remain."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One item picked and placed."""
+
+    item: str
+    source: str
+    destination: str
+    region: str = ""
+    """The region in which the item is placed; empty for anywhere on (or in) the destination."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The steps of a plan, or None where none exists, and how many states were expanded."""
+
+    steps: tuple[Step, ...] | None
+    expanded: int
+
+
+def actions(step: Step, problem: Problem) -> tuple[str, str]:
+    """The pick and the place of a step as ground PDDL actions of :data:`~stages.planning.pddl.DOMAIN`."""
+    pick = fact("pick-from" if step.source in problem.concave else "pick", step.item, step.source)
+    if step.region:
+        parent = problem.regions[step.item].parent
+        return pick, fact("place-at-region", step.item, step.region, parent, step.destination)
+    return pick, fact("place-in" if step.destination in problem.concave else "place-on", step.item, step.destination)
+
+
+def breadth_first(problem: Problem, *, reluctant: Collection[str] = ()) -> Solution:
+    """The shortest plan. Among equally short ones it moves ``reluctant`` items as late as it can.
+
+    A state's moves are pick-and-place pairs, since nothing else can follow a pick. Where one of them puts an item
+    where it finally belongs, it is the only one followed: that item has to make that move sometime, and making it
+    now is in nobody's way.
+    """
+    order = sorted(problem.items, key=lambda item: item in reluctant)
+    start: State = (tuple(problem.supports.values()), problem.held, problem.obstructions)
+    search = _Search(problem, tuple(order))
+    parents: dict[State, tuple[State, Step] | None] = {start: None}
+    frontier, expanded = [start], 0
+    while frontier:
+        following: list[State] = []
+        for state in frontier:
+            if search.reached(state):
+                return Solution(_path(parents, state), expanded)
+            expanded += 1
+            for step, successor in search.moves(state):
+                if successor not in parents:
+                    parents[successor] = (state, step)
+                    following.append(successor)
+        frontier = following
+    return Solution(None, expanded)
+
+
+def _path(parents: dict[State, tuple[State, Step] | None], state: State) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    while (came := parents[state]) is not None:
+        state, step = came
+        steps.append(step)
+    return tuple(reversed(steps))
+
+
+class _Search:
+    """What follows from a state."""
+
+    def __init__(self, problem: Problem, order: tuple[str, ...]) -> None:
+        self._problem = problem
+        self._movable = [item for item in order if item in problem.graspable]
+        self._index = {item: i for i, item in enumerate(problem.items)}
+        self._roomy = problem.roomy
+
+    def reached(self, state: State) -> bool:
+        """Whether the goal holds."""
+        supports, held, _ = state
+        problem = self._problem
+        placed = all(supports[self._index[item]] == support for item, support in problem.goal.items())
+        return placed and held >= problem.regions.keys() and problem.clear.isdisjoint(supports)
+
+    def moves(self, state: State) -> list[tuple[Step, State]]:
+        """The moves worth following: the first that is final, or else all."""
+        found: list[tuple[Step, State]] = []
+        for item in self._movable:
+            if item in state[0] or self._settled(item, state):  # Something rests on it, or it may stay.
+                continue
+            for step, successor in self._moves_of(item, state):
+                if self._settled(item, successor):
+                    return [(step, successor)]
+                found.append((step, successor))
+        return found
+
+    def _moves_of(self, item: str, state: State) -> Iterator[tuple[Step, State]]:
+        supports, held, obstructions = state
+        at, regions = self._index[item], self._problem.regions
+        held -= {child for child in held if child == item or regions[child].parent == item}
+        obstructions = frozenset(entry for entry in obstructions if entry[0] != item)
+        lifted = (*supports[:at], "", *supports[at + 1 :])
+        for destination in self._problem.destinations(item):
+            if destination not in self._roomy and destination in lifted:
+                continue
+            if any(entry[1:] == (item, destination) for entry in obstructions):
+                continue
+            placed = (*supports[:at], destination, *supports[at + 1 :])
+            if self._region_on(item, destination, lifted):
+                step = Step(item, supports[at], destination, regions[item].name)
+                yield step, (placed, held | {item}, obstructions)
+            yield Step(item, supports[at], destination), (placed, held, obstructions)
+
+    def _region_on(self, item: str, destination: str, supports: tuple[str, ...]) -> bool:
+        """Whether the item's region is on this support: where the goal has it, if the region's parent is there."""
+        region = self._problem.regions.get(item)
+        here = destination == self._problem.goal.get(item)
+        return region is not None and here and supports[self._index[region.parent]] == destination
+
+    def _settled(self, item: str, state: State) -> bool:
+        """Whether an item is where it belongs and nothing below or beside it will have to move."""
+        supports, held, obstructions = state
+        if item == TABLE:
+            return True
+        if supports[self._index[item]] != self._problem.goal.get(item):
+            return False
+        if any(entry[0] == item for entry in obstructions):
+            return False
+        region = self._problem.regions.get(item)
+        beside = region is None or (item in held and self._settled(region.parent, state))
+        return beside and self._settled(self._problem.goal[item], state)
+
+
+def check_engine(engine: str) -> None:
+    """Raises :class:`runner.contract.Refused` for what is neither ``bfs`` nor an installed planner."""
+    if engine == BFS:
+        return
+    from unified_planning.shortcuts import get_environment
+
+    factory = get_environment().factory
+    known = [BFS, *(name for name in factory.engines if factory.engine(name).is_oneshot_planner())]
+    if engine not in known:
+        raise Refused(
+            f"planner.engine={engine!r}: known are {', '.join(known)} (unified-planning finds what is installed)"
+        )
+
+
+def with_engine(engine: str, problem_pddl: str, problem: Problem) -> Solution:
+    """A plan by an installed engine of unified-planning, from the PDDL alone."""
+    from unified_planning.engines import PlanGenerationResultStatus as Status
+    from unified_planning.io import PDDLReader
+    from unified_planning.shortcuts import OneshotPlanner, get_environment
+
+    get_environment().credits_stream = None
+    with warnings.catch_warnings():
+        # unified-planning uses old names of pyparsing, and warns of engines that do not say whether they are complete.
+        warnings.simplefilter("ignore")
+        parsed = PDDLReader().parse_problem_string(DOMAIN, problem_pddl)
+        with OneshotPlanner(name=engine) as planner:
+            result = planner.solve(parsed)  # pyright: ignore[reportAttributeAccessIssue]
+    if result.status is Status.UNSUPPORTED_PROBLEM:
+        raise Refused(f"planner.engine={engine!r} does not read this PDDL (:adl); {BFS} does")
+    if result.status not in (Status.SOLVED_SATISFICING, Status.SOLVED_OPTIMALLY):
+        return Solution(None, 0)
+    ground = [(item.action.name, *map(str, item.actual_parameters)) for item in result.plan.actions]
+    return Solution(tuple(_steps(ground, problem)), 0)
+
+
+def _steps(ground: list[tuple[str, ...]], problem: Problem) -> Iterator[Step]:
+    """Pairs of ground actions, a pick and the place that follows it, as steps."""
+    names = {symbol(name): name for name in (TABLE, *problem.items)}
+    for (_, item, source), (_, _, *where) in zip(ground[::2], ground[1::2], strict=True):
+        at_region = len(where) == 3
+        region = problem.regions[names[item]].name if at_region else ""
+        yield Step(names[item], names[source], names[where[-1]], region)

@@ -1,0 +1,231 @@
+"""Which poses would do for each transfer: supported, free of others, within reach, with room for the gripper."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from runner.contract import Refused
+from stages.perception.poses import inverse
+from stages.planning.placements import Placement, Placements, Scene
+from stages.planning.problem import TABLE
+from stages.planning.search import Step
+from stages.scene import regions
+from stages.scene.catalogue import Floats, Grasp
+from stages.scene.standing import Standing
+
+TOUCHING = 0.002
+"""Objects whose heights overlap by less than this are above each other, metres."""
+HAND = (0.14, 0.05)
+"""Length along the approach and thickness of the gripper with its fingers, metres."""
+FINGER = 0.035
+"""Room that an opening finger takes beside the object, metres."""
+CROWDED = 0.08
+"""Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
+
+ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
+"""Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workspace:
+    """Where the robot places, in the base frame, and how much room objects need; metres."""
+
+    x: tuple[float, float] = (0.45, 0.80)
+    y: tuple[float, float] = (-0.42, 0.42)
+    clearance: float = 0.005
+    """Least gap between footprints."""
+    spacing: float = 0.06
+    """Gap that objects put aside should keep."""
+    targets: int = 12
+    """Poses offered for each transfer."""
+    considered: int = 500
+    """Poses considered for each transfer."""
+
+    def __post_init__(self) -> None:
+        """Refuses empty areas and limits."""
+        for name in ("x", "y"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise Refused(f"planner.workspace.{name}={[low, high]}: must be [lowest, highest] in metres")
+        for name in ("targets", "considered"):
+            if getattr(self, name) < 1:
+                raise Refused(f"planner.workspace.{name}={getattr(self, name)}: must be 1 or more")
+
+    def outside(self, T_base_object: Floats) -> float:
+        """How far a pose lies outside the area, metres; 0 inside."""
+        (x0, x1), (y0, y1) = self.x, self.y
+        x, y = T_base_object[:2, 3]
+        return float(np.hypot(max(x0 - x, x - x1, 0.0), max(y0 - y, y - y1, 0.0)))
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """A step for which there is no pose, and the objects that take up the room (none: there is no room at all)."""
+
+    step: Step
+    obstacles: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Crowded:
+    """A step whose object would stand in the way of a later pick: it is better placed after that."""
+
+    step: Step
+
+
+class Targets:
+    """Chooses poses for the steps of a plan, each in the scene that the steps before it leave behind."""
+
+    def __init__(self, placements: Placements, workspace: Workspace) -> None:
+        self._placements = placements
+        self._workspace = workspace
+
+    def of(
+        self,
+        steps: Sequence[Step],
+        scene: Scene,
+        goal: dict[str, str],
+        *,
+        again: Iterable[Step] = (),
+        late: Collection[str] = (),
+    ) -> list[Floats] | Blocked | Crowded:
+        """T_base_targets of every step, best first, N x 4 x 4 each; or the first step that should not come now.
+
+        ``goal`` maps the objects of the goal to what carries them. Steps ``again`` failed before with the best poses
+        and get those that come next. Items that are ``late`` already may crowd others.
+        """
+        chosen: list[Floats] = []
+        repeated = set(again)
+        for k, step in enumerate(steps):
+            final = step.destination == goal.get(step.item) and not any(s.item == step.item for s in steps[k + 1 :])
+            tried = self._goal_poses(step, scene) if final else self._free_spots(step, steps[k + 1 :], scene)
+            if isinstance(tried, Blocked):
+                return tried
+            best = self._with_room(tried, step, scene)
+            best = best[self._workspace.targets :] or best if step in repeated else best
+            best = best[: self._workspace.targets]
+            pending = {after.item for after in steps[k + 1 :]} - {step.item}
+            if step.item not in late and any(_clearance(best[0], scene.standing[name]) < CROWDED for name in pending):
+                return Crowded(step)
+            chosen.append(np.stack([scene.T_base_table @ item.T_table_object for item in best]))
+            scene = scene.after(step.item, best[0], step.destination)
+        return chosen
+
+    def _goal_poses(self, step: Step, scene: Scene) -> list[Placement] | Blocked:
+        placements = self._placements.of(step, scene)
+        strict = self._free(step, scene, placements, strict=True)
+        return strict if isinstance(strict, list) else self._free(step, scene, placements, strict=False)
+
+    def _free(
+        self, step: Step, scene: Scene, placements: Sequence[Placement], *, strict: bool
+    ) -> list[Placement] | Blocked:
+        """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
+        others = scene.others(step.item, step.destination)
+        valid: list[Placement] = []
+        blocking: list[tuple[str, ...]] = []
+        supported = (p for p in placements if self._supported(p.standing, step.destination, scene, strict=strict))
+        for placement in islice(supported, self._workspace.considered):
+            if any(_alike(placement.standing, other.standing) for other in valid):
+                continue
+            item = scene.rested(placement.standing, step.destination)
+            hit = tuple(other.name for other in others if _clearance(item, other) < self._workspace.clearance)
+            if hit:
+                blocking.append(hit)
+                continue
+            outside = self._workspace.outside(scene.T_base_table @ item.T_table_object)
+            valid.append(Placement(item, placement.cost + 0.5 * outside))
+            if len(valid) == 2 * self._workspace.targets:
+                break
+        return valid or Blocked(step, min(blocking, key=lambda hit: _effort(hit, scene), default=()))
+
+    def _supported(self, item: Standing, destination: str, scene: Scene, *, strict: bool) -> bool:
+        """Whether the surface carries the object: within reach of the arm, inside the cavity, or by its middle."""
+        if destination == TABLE:
+            return self._workspace.outside(scene.T_base_table @ item.T_table_object) == 0
+        carrier = scene.standing[destination]
+        surface = carrier.floor if carrier.stance.cavity else carrier.top
+        if strict and carrier.stance.cavity:
+            return regions.inside(item.bottom, surface)
+        return bool(regions.depth(surface, regions.centroid(item.bottom)[None])[0] >= 0)
+
+    def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> list[Placement] | Blocked:
+        """Places on the table, near and with space around them, where nothing of the goal will stand."""
+        item = scene.standing[step.item]
+        others = scene.others(step.item, TABLE)
+        reserved = self._placements.reserved(pending, scene)
+        spots: list[Placement] = []
+        for spot in self._grid(item, scene):
+            room = min((_clearance(spot, other) for other in others), default=np.inf)
+            free = min((regions.separation(spot.outline, other.outline) for other in reserved), default=np.inf)
+            if room < self._workspace.clearance:
+                continue
+            distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
+            crowded = max(0.0, self._workspace.spacing - min(room, free))
+            spots.append(Placement(spot, 0.2 * distance + 2 * crowded))
+        spots.sort(key=lambda placement: placement.cost)
+        return spots[: 2 * self._workspace.targets] or Blocked(step, ())
+
+    def _grid(self, item: Standing, scene: Scene) -> list[Standing]:
+        """The object as it is, on the table, at every 3 cm of the robot's area."""
+        (x0, x1), (y0, y1) = self._workspace.x, self._workspace.y
+        T_table_base = inverse(scene.T_base_table)
+        spots: list[Standing] = []
+        for x in np.arange(x0, x1, 0.03):
+            for y in np.arange(y0, y1, 0.03):
+                T = item.T_table_stance.copy()
+                T[:2, 3] = (T_table_base @ [x, y, scene.T_base_table[2, 3], 1.0])[:2]
+                spots.append(scene.rested(Standing(item.name, item.stance, T), TABLE))
+        return spots
+
+    def _with_room(self, placements: Sequence[Placement], step: Step, scene: Scene) -> list[Standing]:
+        """Sorted again: a pose at which few grasps have room for the gripper comes later."""
+        others = scene.others(step.item, step.destination)
+        costs = [p.cost + 0.05 * (1 - _share_of_grasps(p.standing, others)) for p in placements]
+        return [placements[k].standing for k in np.argsort(costs, kind="stable")]
+
+
+def neighbours(name: str, scene: Scene) -> list[str]:
+    """The objects that stand in the way of a hand that picks one, nearest first."""
+    item = scene.standing[name]
+    gaps = {other.name: _clearance(item, other) for other in scene.others(name, scene.supports[name])}
+    return sorted((other for other in gaps if gaps[other] < CROWDED), key=lambda other: gaps[other])
+
+
+def _alike(a: Standing, b: Standing) -> bool:
+    """Whether two poses of an object differ so little that the arm reaches both or none."""
+    turn = a.T_table_object[:3, :3].ravel() @ b.T_table_object[:3, :3].ravel()
+    return bool(np.linalg.norm((a.T_table_stance - b.T_table_stance)[:2, 3]) < ALIKE[0] and turn > ALIKE[1])
+
+
+def _effort(obstacles: tuple[str, ...], scene: Scene) -> tuple[int, int]:
+    """How hard it is to clear a place: obstacles that nobody can move, then obstacles."""
+    fixed = sum(not scene.standing[name].stance.item.grasps for name in obstacles)
+    return fixed, len(obstacles)
+
+
+def _clearance(a: Standing, b: Standing) -> float:
+    """Gap between footprints, metres, negative where they overlap; infinite where one is above the other."""
+    apart = a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING
+    return np.inf if apart else regions.separation(a.outline, b.outline)
+
+
+def _share_of_grasps(item: Standing, others: Sequence[Standing]) -> float:
+    """Share of the object's grasps at which the open gripper touches nothing else."""
+    grasps = item.stance.item.grasps
+    near = [other for other in others if regions.separation(item.outline, other.outline) < HAND[0] + FINGER]
+    return sum(_hand_fits(grasp, item, near) for grasp in grasps) / max(1, len(grasps))
+
+
+def _hand_fits(grasp: Grasp, item: Standing, others: Sequence[Standing]) -> bool:
+    half = grasp.width / 2 + FINGER
+    length, thickness = HAND
+    corners = [[x, y, z, 1.0] for x in (-length, 0.0) for y in (-half, half) for z in (-thickness / 2, thickness / 2)]
+    points = np.array(corners) @ (item.T_table_object @ grasp.T_object_grasp).T
+    outline = regions.hull(points[:, :2])
+    low, high = points[:, 2].min(), points[:, 2].max()
+    level = [other for other in others if other.z_bottom < high and other.z_top > low]
+    return all(regions.separation(outline, other.outline) > 0 for other in level)

@@ -1,0 +1,1 @@
+"""The object catalogue, meshes, relations and virtual objects."""

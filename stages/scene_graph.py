@@ -1,0 +1,76 @@
+"""Scene estimate in, scene graph out: relations between the objects and regions for what stands side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from runner.contract import Refused, Stage
+from stages.messages import SceneEstimate, SceneGraph
+from stages.messages.scene import SceneObject
+from stages.perception.poses import inverse
+from stages.scene import relations, virtual
+from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.relations import Tolerances
+from stages.scene.standing import Stances, Standing
+
+
+class SceneGraphBuilder(Stage):
+    """Asserts exist, clear, on, in and has of every estimated scene."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """What counts as touching and as beside."""
+
+        catalogue: str
+        gap: float = 0.06
+        """Objects on the same support with less than this between their footprints are side by side, metres."""
+        radius: float = 0.04
+        """Radius of the region in which an object counts as still beside the other, metres."""
+        tolerances: Tolerances = field(default_factory=Tolerances)
+
+        def __post_init__(self) -> None:
+            """Refuses distances that are not positive."""
+            for name in ("gap", "radius"):
+                if not getattr(self, name) > 0:
+                    raise Refused(f"scene_graph.{name}={getattr(self, name)}: must be a positive number of metres")
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        catalogue = Catalogue.load(Path(config.catalogue))
+        self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
+
+    def on_scene_estimate(self, scene_estimate: SceneEstimate) -> SceneGraph:
+        """The scene graph of an estimate; objects the catalogue does not hold are refused."""
+        T_table_camera = inverse(scene_estimate.T_camera_table)
+        standing = [
+            Standing.at(item.name, self._stances_of(item.label), T_table_camera @ item.T_camera_object)
+            for item in scene_estimate.objects
+        ]
+        supports = relations.supports(standing, self._config.tolerances)
+        regions = virtual.virtual_objects(standing, supports, gap=self._config.gap, radius=self._config.radius)
+        T_base_camera = scene_estimate.T_base_camera if scene_estimate.T_base_camera is not None else T_table_camera
+        return SceneGraph(
+            objects=_objects(scene_estimate, T_base_camera),
+            virtual_objects=regions,
+            assertions=(*relations.assertions(supports), *virtual.assertions(regions)),
+            T_base_table=T_base_camera @ scene_estimate.T_camera_table,
+            T_base_camera=scene_estimate.T_base_camera,
+            K=scene_estimate.K,
+            name=scene_estimate.name,
+            scene_id=scene_estimate.scene_id,
+            image_id=scene_estimate.image_id,
+        )
+
+    def _stances_of(self, label: str) -> Stances:
+        if label not in self._stances:
+            known = ", ".join(sorted(self._stances))
+            raise Refused(f"scene_graph: object {label!r} is not in {self._config.catalogue}; known: {known}")
+        return self._stances[label]
+
+
+def _objects(estimate: SceneEstimate, T_base_camera: Floats) -> tuple[SceneObject, ...]:
+    return tuple(
+        SceneObject(name=item.name, label=item.label, T_base_object=T_base_camera @ item.T_camera_object)
+        for item in estimate.objects
+    )

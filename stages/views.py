@@ -1,0 +1,390 @@
+"""What each message of the graph looks like: images, meshes, particles, graphs and text."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from colorsys import hsv_to_rgb
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runner.contract import Message, Refused
+from runner.drawing import (
+    BarChart,
+    Boxes2D,
+    Clear,
+    Color,
+    Column,
+    DepthImage,
+    Drawing,
+    Graph,
+    Image,
+    Layout,
+    Mesh3D,
+    NextStep,
+    Panel,
+    Pinhole,
+    Points3D,
+    Row,
+    Scalar,
+    Tabs,
+    Text,
+    Transform,
+)
+from stages.messages import (
+    Arrangement,
+    Candidates,
+    Frame,
+    Goal,
+    LookRequest,
+    Observation,
+    Outcome,
+    Plan,
+    Posterior,
+    RobotCommand,
+    RobotState,
+    SceneEstimate,
+    SceneGraph,
+    Snapshot,
+    TransferRequest,
+    Verdict,
+)
+from stages.messages.digest import ParticleTrace
+from stages.perception.camera_model import back_project
+from stages.perception.renderer import Camera, Item, Renderer
+from stages.scene.catalogue import Catalogue, Floats, Mesh
+from stages.scene.relations import TABLE
+from stages.scene.text import support
+
+MOTION_FRAMES = 8
+"""Postures shown of one robot motion."""
+TABLE_SIZE = (0.7, 1.1)
+"""Metres of support plane drawn around the objects, along x and y of the base."""
+NODE_SPACING = (130.0, 110.0)
+"""Pixels between the nodes of a scene graph, across and down."""
+_GREY: Color = (128, 128, 128)
+_BLUE: Color = (86, 156, 214)
+_GREEN: Color = (106, 190, 120)
+_ORANGE: Color = (230, 150, 70)
+
+
+class Views:
+    """Draws messages; remembers frames and posteriors until their scene estimate comes."""
+
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
+        paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
+        if not paths:
+            raise Refused(f"view: none of the stages {', '.join(configs)} has a setting `catalogue`; objects need one")
+        self._catalogue = Catalogue.load(Path(paths[0]))
+        self._colors = palette(list(self._catalogue.objects))
+        self._frames: dict[tuple[int, int, str], Frame] = {}
+        self._posteriors: deque[Posterior] = deque(maxlen=512)
+        self._joints: dict[str, float] = {}
+        self._renderers: dict[tuple[int, int], Renderer] = {}
+        self._shown: dict[str, str] = {}
+        """Objects whose meshes stand in the world, with their labels."""
+        self._progress: list[str] = []
+
+    def layout(self) -> Layout:
+        """Images to the left, the world in the middle, what is known of it to the right; for 16:10."""
+        images = Column(
+            (
+                Panel("Camera and candidates", "image", "camera"),
+                Panel("Estimate over observation", "image", "estimate"),
+                Panel("Depth", "image", "depth"),
+            )
+        )
+        filters = Row(
+            (
+                Panel("Best cost over iterations", "series", "cost"),
+                Tabs((Panel("Hypotheses' weights", "bars", "weights"), Panel("Look", "text", "look"))),
+            )
+        )
+        world = Column(
+            (Panel("World", "space", "world", eye=(1.6, -0.9, 1.45), target=(0.55, 0.03, 0.85)), filters),
+            shares=(3, 1.2),
+        )
+        knowledge = Column(
+            (
+                Panel("Scene graph", "graph", "graph/scene"),
+                Panel("Goal", "graph", "graph/goal"),
+                Tabs((Panel("Progress", "text", "text/progress"), Panel("Plan", "text", "text/plan"))),
+            ),
+            shares=(1.2, 1.2, 1),
+        )
+        return Row((images, world, knowledge), shares=(1, 1.7, 1.1))
+
+    def static(self) -> Iterable[Drawing]:
+        """Nothing: even the robot is only there once it speaks."""
+        return ()
+
+    def draw(self, message: Message) -> Iterator[Drawing]:
+        """What one message shows."""
+        match message:
+            case Frame():
+                yield from self._frame(message)
+            case Candidates():
+                yield candidate_boxes(message, self._colors)
+            case Observation():
+                yield from observation_points(message)
+            case Posterior():
+                self._posteriors.append(message)
+            case SceneEstimate():
+                yield from self._estimate(message)
+            case SceneGraph():
+                yield from self._scene(message)
+            case RobotState(joint_names=names, positions=positions):
+                yield from self._robot(names, positions)
+            case Snapshot(joint_names=names, joint_positions=positions):
+                yield from self._robot(names, positions)
+            case RobotCommand():
+                yield from self._motion(message)
+            case _:
+                yield from self._task(message)
+
+    def _task(self, message: Message) -> Iterator[Drawing]:
+        if isinstance(message, Goal):
+            yield scene_nodes("graph/goal", message.scene, self._catalogue)
+        if isinstance(message, Plan):
+            yield Text("text/plan", plan_text(message))
+        line = progress_line(message)
+        if line:
+            self._progress.append(line)
+            yield Text("text/progress", "\n".join(f"- {item}" for item in self._progress))
+
+    def _frame(self, frame: Frame) -> Iterator[Drawing]:
+        self._frames[frame.scene_id, frame.image_id, frame.name] = frame
+        for key in list(self._frames)[:-64]:
+            del self._frames[key]
+        yield Clear("camera/candidates")
+        yield Clear("world/camera/particles")
+        yield Clear("cost")
+        yield Image("camera/rgb", frame.rgb)
+        yield DepthImage("depth/image", frame.depth)
+        if frame.T_base_camera is not None:
+            height, width = frame.depth.shape
+            yield Transform("world/camera", frame.T_base_camera)
+            yield Pinhole("world/camera/frustum", frame.K, width, height)
+
+    def _estimate(self, estimate: SceneEstimate) -> Iterator[Drawing]:
+        yield Transform("world/camera", base_from_camera(estimate))
+        winner = next((item for item in self._posteriors if _same_objects(item, estimate)), None)
+        if winner is not None:
+            yield from particle_frames(winner, self._colors)
+        yield BarChart("weights/hypotheses", estimate.log_weights - estimate.log_weights.min(), _BLUE)
+        yield Text("look", look_text(estimate))
+        frame = self._frames.pop((estimate.scene_id, estimate.image_id, estimate.name), None)
+        if frame is not None:
+            yield Image("estimate/rgb", self._overlay(frame, estimate))
+
+    def _overlay(self, frame: Frame, estimate: SceneEstimate) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        """The observation in grey with the estimated objects, rendered, laid over it."""
+        height, width = frame.depth.shape
+        if (width, height) not in self._renderers:
+            self._renderers[width, height] = Renderer(width, height)
+        items = [Item(self._catalogue[item.label].mesh, item.T_camera_object) for item in estimate.objects]
+        camera = Camera(K=frame.K, T_world_camera=np.eye(4))
+        rendered = self._renderers[width, height].color(items, camera)
+        grey = np.repeat(frame.rgb.mean(axis=2, keepdims=True), 3, axis=2)
+        covered = rendered.any(axis=2, keepdims=True)
+        return np.where(covered, 0.2 * grey + 0.8 * rendered, grey).astype(np.uint8)
+
+    def _scene(self, scene: SceneGraph) -> Iterator[Drawing]:
+        labels = {item.name: item.label for item in scene.objects}
+        yield from (Clear(f"world/objects/{name}") for name in sorted(set(self._shown) - set(labels)))
+        yield table_plane(scene)
+        for item in scene.objects:
+            path = f"world/objects/{item.name}"
+            yield Transform(path, item.T_base_object)
+            if self._shown.get(item.name) != item.label:
+                yield _mesh(f"{path}/mesh", self._catalogue[item.label].mesh)
+        self._shown = labels
+        yield scene_nodes("graph/scene", scene, self._catalogue)
+
+    def _robot(self, names: Sequence[str], positions: Floats) -> Iterator[Drawing]:
+        if not self._joints:
+            yield from robot_shapes()
+        self._joints.update(zip(names, positions.tolist(), strict=True))
+        yield from robot_posture(self._joints)
+
+    def _motion(self, command: RobotCommand) -> Iterator[Drawing]:
+        """The commanded motion, thinned; the robot must have been drawn before."""
+        if not self._joints or not len(command.times):
+            return
+        for row in np.unique(np.linspace(0, len(command.times) - 1, MOTION_FRAMES).round().astype(int)):
+            yield NextStep()
+            self._joints.update(zip(command.joint_names, command.positions[row].tolist(), strict=True))
+            yield from robot_posture(self._joints)
+
+
+def palette(labels: Sequence[str]) -> dict[str, Color]:
+    """A colour per label, spread around the colour circle; the same labels always get the same ones."""
+    golden = 0.618034
+    shades = [hsv_to_rgb(k * golden % 1, 0.65, 0.95) for k in range(len(labels))]
+    return {
+        label: (round(255 * r), round(255 * g), round(255 * b)) for label, (r, g, b) in zip(labels, shades, strict=True)
+    }
+
+
+def candidate_boxes(message: Candidates, colors: Mapping[str, Color]) -> Boxes2D:
+    """The candidates over the camera image, with label and confidence."""
+    found = message.candidates
+    return Boxes2D(
+        "camera/candidates",
+        np.array([item.box for item in found]).reshape(-1, 4),
+        labels=tuple(f"{item.label} {item.confidence:.2f}" for item in found),
+        colors=tuple(colors.get(item.label, _GREY) for item in found),
+    )
+
+
+def observation_points(message: Observation) -> Iterator[Drawing]:
+    """What stands above the support plane, as coloured points in the camera's frame."""
+    rows, columns = np.nonzero(message.foreground & (message.depth > 0))
+    yield Transform("world/camera", base_from_camera(message))
+    points = back_project(message.depth, message.K)[rows, columns]
+    yield Points3D("world/camera/observation", points, message.rgb[rows, columns], radius=0.001)
+
+
+def base_from_camera(message: Observation | SceneEstimate) -> Floats:
+    """T_base_camera, 4 x 4; without a robot the support plane is the base."""
+    if message.T_base_camera is not None:
+        return message.T_base_camera
+    return np.linalg.inv(message.T_camera_table).astype(np.float64)
+
+
+def particle_frames(posterior: Posterior, colors: Mapping[str, Color]) -> Iterator[Drawing]:
+    """The particles of each object over the kept iterations, one step each, and the best cost."""
+    for item, trace in zip(posterior.objects, posterior.traces, strict=False):
+        for iteration, cost in zip(trace.iterations, trace.costs.tolist(), strict=True):
+            yield NextStep()
+            positions = _particles(trace, iteration)
+            yield Points3D(f"world/camera/particles/{item.name}", positions, colors.get(item.label, _GREY))
+            yield Scalar(f"cost/{item.name}", cost, item.name)
+
+
+def _particles(trace: ParticleTrace, iteration: int) -> Floats:
+    return trace.positions[trace.positions[:, 0] == iteration, 1:]
+
+
+def look_text(estimate: SceneEstimate) -> str:
+    """The winning hypothesis in words."""
+    title = f"### Hypothesis {estimate.winner} of {len(estimate.log_weights)} wins"
+    left_out = f"\n{estimate.left_out} combinations were left out by the cap." if estimate.left_out else ""
+    rows = [
+        f"| {item.name} | {item.confidence:.2f} | {item.cost:.1f} | {item.visible:.0%} |" for item in estimate.objects
+    ]
+    return "\n".join([title, left_out, "| object | confidence | cost | visible |", "|---|---|---|---|", *rows])
+
+
+def table_plane(scene: SceneGraph) -> Mesh3D:
+    """The support plane, centred below the objects."""
+    origin, normal = scene.T_base_table[:3, 3], scene.T_base_table[:3, 2]
+    center = np.mean([item.T_base_object[:2, 3] for item in scene.objects] or [origin[:2]], axis=0)
+    corners = center + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(TABLE_SIZE) / 2
+    # A millimetre low, so that the bottoms of objects show.
+    heights = origin[2] - (corners - origin[:2]) @ normal[:2] / normal[2] - 0.001
+    return Mesh3D("world/table", np.column_stack([corners, heights]), np.array([[0, 1, 2], [0, 2, 3]]), (170, 150, 125))
+
+
+def scene_nodes(path: str, scene: SceneGraph, catalogue: Catalogue) -> Graph:
+    """Objects hang on what carries them; virtual objects link the two that belong beside each other."""
+    carried = support(scene)
+    nodes = {TABLE: (TABLE, _GREY)}
+    edges = [(supporter, name) for name, (supporter, _) in carried.items()]
+    for item in scene.objects:
+        supporter, how = carried[item.name]
+        label = item.name if supporter == TABLE else f"{how}: {item.name}"
+        nodes[item.name] = (label, _ORANGE if catalogue[item.label].concave else _BLUE)
+    for virtual in scene.virtual_objects:
+        nodes[virtual.name] = (f"beside {virtual.parent}", _GREEN)
+        edges += [(virtual.parent, virtual.name), (virtual.name, virtual.child)]
+    labels, colors = zip(*nodes.values(), strict=True)
+    places = node_places(scene)
+    positions = np.array([places[name] for name in nodes]) * np.array(NODE_SPACING)
+    return Graph(path, tuple(nodes), labels, tuple(edges), colors, positions)
+
+
+def node_places(scene: SceneGraph) -> dict[str, tuple[float, float]]:
+    """(column, row) of every node: a tree with the table on top; a region hangs between its parent and child."""
+    carried = support(scene)
+    places: dict[str, tuple[float, float]] = {}
+    columns = count()
+
+    def place(name: str, row: int) -> float:
+        children = [child for child, (supporter, _) in carried.items() if supporter == name]
+        inner = [place(child, row + 1) for child in children]
+        column = sum(inner) / len(inner) if inner else float(next(columns))
+        places[name] = (column, float(row))
+        return column
+
+    place(TABLE, 0)
+    for virtual in scene.virtual_objects:
+        (x0, y0), (x1, y1) = places[virtual.parent], places[virtual.child]
+        places[virtual.name] = ((x0 + x1) / 2, (y0 + y1) / 2 + 0.5)
+    return places
+
+
+def plan_text(plan: Plan) -> str:
+    """The plan as a numbered list, or why there is none."""
+    if plan.status != "solved":
+        return f"### {plan.status}\n{plan.reason}"
+    steps = [f"{number}. `{item.pick}` `{item.place}`" for number, item in enumerate(plan.transfers, 1)]
+    return "\n".join(["### Plan", *steps, "", f"{plan.expanded} states expanded"])
+
+
+def progress_line(message: Message) -> str:
+    """A line of the episode's story; empty for messages that do not move it on."""
+    line = ""
+    match message:
+        case Arrangement(kind=kind):
+            line = f"the person lays out the **{kind}** scene"
+        case LookRequest(purpose=purpose):
+            line = f"look: {purpose}"
+        case Goal(name=name):
+            line = f"goal **{name}** remembered"
+        case Plan(status=status, transfers=transfers):
+            line = f"plan {status}" + (f", {len(transfers)} transfers" if transfers else "")
+        case TransferRequest(number=number, transfer=transfer):
+            line = f"transfer {number}: {transfer.object} to {transfer.destination}"
+        case Outcome(number=number, success=success, failed_stage=stage, reason=reason):
+            line = f"transfer {number} " + ("done" if success else f"failed at {stage}: {reason}")
+        case Verdict(success=success, reason=reason):
+            line = f"**{'restored' if success else 'not restored'}**: {reason}"
+        case _:
+            pass
+    return line
+
+
+def robot_shapes() -> Iterator[Drawing]:
+    """The meshes of every link, each below its link's path, flat-shaded: corners that share a vertex look dented."""
+    # Graphs without a robot need not have one installed.
+    from stages.devices.fetch import robot_meshes
+
+    for number, (link, mesh) in enumerate(robot_meshes()):
+        corners = mesh.faces.reshape(-1)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        yield Mesh3D(f"world/robot/{link}/mesh_{number}", mesh.vertices[corners], faces, mesh.colors[corners])
+
+
+def robot_posture(joints: Mapping[str, float]) -> Iterator[Drawing]:
+    """Where the links are for these joint positions."""
+    from stages.devices.fetch import link_poses, robot_meshes
+
+    poses = link_poses(list(joints), np.array(list(joints.values())))
+    for link in sorted({link for link, _ in robot_meshes()}):
+        yield Transform(f"world/robot/{link}", poses[link])
+
+
+def _mesh(path: str, mesh: Mesh) -> Mesh3D:
+    return Mesh3D(path, mesh.vertices, mesh.faces, mesh.colors)
+
+
+def _same_objects(posterior: Posterior, estimate: SceneEstimate) -> bool:
+    pairs = zip(posterior.objects, estimate.objects, strict=False)
+    return len(posterior.objects) == len(estimate.objects) and all(
+        a.label == b.label and np.array_equal(a.T_camera_object, b.T_camera_object) for a, b in pairs
+    )

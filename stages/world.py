@@ -1,0 +1,95 @@
+"""Arrangements, looks and commands in, robot states and snapshots out: the simulated world and its scripted person."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from runner.contract import Context, Refused, Stage
+from stages.devices import fetch, tabletop
+from stages.devices.simulation import Simulation
+from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.scene.catalogue import Catalogue
+
+_DRIFT = 0.01
+"""Metres that an object may move while the scene settles before the arrangement counts as failed."""
+_TILT = 0.995
+"""Cosine of the largest tilt of an object that still stands."""
+_DRAWS = 20
+
+
+class World(Stage):
+    """A table, a tray, objects and a robot in MuJoCo; a person lays out scenes between the robot's tasks."""
+
+    device = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """``seed`` draws the scenes; ``goal`` is a goal template by name or ``auto`` (chosen by the seed)."""
+
+        catalogue: str = "stages/scene/catalogue.yaml"
+        seed: int = 0
+        goal: str = "auto"
+
+        def __post_init__(self) -> None:
+            if self.seed < 0:
+                raise Refused(f"world.seed: {self.seed} is negative; choose 0, 1, 2, ...")
+            tabletop.goal_name(self.goal, self.seed)
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._goal = tabletop.goal_name(config.goal, config.seed)
+        self._simulation = Simulation(self._catalogue, tabletop.object_names(self._goal))
+
+    def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
+        """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
+        rng = np.random.default_rng([self._config.seed, int(arrangement.kind == "start")])
+        sample = tabletop.sample_goal if arrangement.kind == "goal" else tabletop.sample_start
+        for _ in range(_DRAWS):
+            layout = sample(self._goal, self._catalogue, rng)
+            self._simulation.arrange(layout)
+            if self._stands(layout):
+                ctx.log(f"{arrangement.kind} scene laid out: {', '.join(layout)}")
+                return self._state()
+        raise RuntimeError(f"no {arrangement.kind} scene of {self._goal} stood in {_DRAWS} draws")
+
+    def on_look_request(self, look_request: LookRequest) -> Snapshot:
+        """The world as it is now, for the simulated camera."""
+        return Snapshot(
+            names=self._simulation.names,
+            T_base_objects=self._simulation.object_poses(),
+            joint_names=fetch.JOINT_NAMES,
+            joint_positions=self._simulation.encoders(),
+            time=self._simulation.time,
+            purpose=look_request.purpose,
+        )
+
+    def on_robot_command(self, robot_command: RobotCommand) -> RobotState:
+        """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders."""
+        error = 0.0
+        if len(robot_command.times):
+            error = self._simulation.follow(
+                robot_command.joint_names, robot_command.times, robot_command.positions, robot_command.velocities
+            )
+        if robot_command.gripper_width is not None:
+            self._simulation.move_gripper(robot_command.gripper_width)
+        return self._state(error)
+
+    def _stands(self, layout: tabletop.Layout) -> bool:
+        poses = dict(zip(self._simulation.names, self._simulation.object_poses(), strict=True))
+        return all(
+            np.linalg.norm(poses[name][:3, 3] - T[:3, 3]) < _DRIFT and poses[name][2, 2] > _TILT
+            for name, T in layout.items()
+        )
+
+    def _state(self, tracking_error: float = 0.0) -> RobotState:
+        return RobotState(
+            joint_names=fetch.JOINT_NAMES,
+            positions=self._simulation.encoders(),
+            gripper_width=self._simulation.gripper_width(),
+            time=self._simulation.time,
+            tracking_error=tracking_error,
+        )

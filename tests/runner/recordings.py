@@ -1,0 +1,96 @@
+"""Makes recordings of the toy graph without processes: the same steps, journal and writer as in a run."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from runner.codec import Envelope, Step, pack
+from runner.graph import Graph, Node, graph_to_json, load_graph
+from runner.inbox import Inbox, Ready
+from runner.recorder import Manifest, RecordingWriter, topic
+from runner.recording import Verdict
+from runner.step import Executor, receive, step_time
+
+TOYS = Path(__file__).with_name("toys.yaml")
+Keep = Callable[[Envelope | Step], Envelope | Step | None]
+
+
+def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manifest:
+    topics = {
+        f"{node.name}/{port}": topic(kind) for node in graph.nodes.values() for port, kind in node.type.outputs.items()
+    }
+    return Manifest("test", "", str(path), graph_to_json(graph), settings, topics)
+
+
+def record_toys(folder: Path, *settings: str, keep: Keep = lambda record: record) -> tuple[Path, Verdict]:
+    """Runs the toy graph in this process and records what ``keep`` lets through."""
+    path = folder / "toys.mcap"
+    settings = (f"sink.path={folder / 'out.txt'}", *settings)
+    graph = load_graph(TOYS, settings)
+    writer = RecordingWriter(manifest(graph, path, settings), print)
+    for record in _run(graph, folder):
+        kept = keep(record)
+        if kept is not None:
+            writer.put(type(kept), pack(kept))
+    return path, writer.close()
+
+
+def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
+    """Steps every stage until nothing is left to do."""
+    executors = {
+        node.name: Executor(node, node.construct(), seed=graph.seed, directory=folder, log=lambda *_: None)
+        for node in graph.nodes.values()
+    }
+    inboxes = {node.name: Inbox(node) for node in graph.nodes.values()}
+    numbers = dict.fromkeys(graph.nodes, 0)
+    sent: deque[Envelope] = deque()
+
+    def journalled(node: Node, handler: str, consumed: tuple[tuple[str, str], ...], out: list[Envelope]) -> Step:
+        ids = tuple(sealed.id for sealed in out)
+        numbers[node.name] += 1
+        return Step(
+            node.name, 0, 0, numbers[node.name] - 1, handler, consumed, ids, out[0].time_ns if out else 0, 0, 0, 1000
+        )
+
+    def step(node: Node, ready: Ready) -> Iterator[Envelope | Step]:
+        time_ns = step_time(node, ready.arrivals, time.time_ns())
+        out = list(executors[node.name].run(ready.handler, ready.arrivals, time_ns))
+        sent.extend(out)
+        consumed = tuple((arrival.port.name, arrival.envelope.id) for arrival in ready.arrivals)
+        yield from [*out, journalled(node, ready.handler.name, consumed, out)]
+
+    for node in graph.nodes.values():
+        if node.type.source is not None:
+            for sealed in executors[node.name].advance(node.type.source, time.time_ns):
+                sent.append(sealed)
+                yield from [sealed, journalled(node, "source", (), [sealed])]
+    while sent:
+        sealed = sent.popleft()
+        stage, _, port = sealed.id.partition("#")[0].partition(".")
+        for route in (route for route in graph.routes(stage) if route.output == port):
+            node = graph.nodes[route.consumer]
+            inboxes[node.name].add(receive(node.type.inputs[route.input], sealed))
+            while ready := inboxes[node.name].pop():
+                yield from step(node, ready)
+
+
+def rewrite(source: Path, target: Path, change: Callable[[str, bytes], bytes]) -> Path:
+    """Copies a recording; ``change`` gets each topic and payload and returns what is kept in its place."""
+    with source.open("rb") as file, target.open("wb") as output:
+        reader, writer = make_reader(file), Writer(output)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        channels: dict[str, int] = {}
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic not in channels:
+                channels[channel.topic] = writer.register_channel(channel.topic, "msgpack", 0)
+            data = change(channel.topic, message.data)
+            times = (message.log_time, data, message.publish_time, message.sequence)
+            writer.add_message(channels[channel.topic], *times)
+        writer.finish()
+    return target

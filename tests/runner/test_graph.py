@@ -1,0 +1,153 @@
+"""Graph files are checked to the last key, each mistake in one line with its place and the valid choices."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+
+from runner.cli import main
+from runner.contract import Refused
+from runner.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
+
+TOYS = Path(__file__).parent / "toys.yaml"
+ROOT = Path(__file__).parents[2]
+OUT = "sink.path=out.txt"
+
+
+def load(folder: Path, *settings: str, old: str = "", new: str = "") -> Graph:
+    text = TOYS.read_text()
+    assert old in text
+    path = folder / "graph.yaml"
+    path.write_text(text.replace(old, new) if old else text)
+    return load_graph(path, settings)
+
+
+def test_a_good_graph_loads(tmp_path: Path):
+    graph = load(tmp_path, OUT)
+    assert graph.processes().count(("worker", 1)) == 1
+    assert graph.nodes["worker"].inputs["number"].queue == 8
+    assert graph.nodes["worker"].shares("piece")
+    assert not graph.nodes["worker"].shares("number")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("replicas: 2", "replica: 2", ":11: stages.worker.replica: unknown key 'replica'; did you mean 'replicas'"),
+        ("seed: 7", "sed: 7", ":2: sed: unknown key 'sed'; did you mean 'seed'"),
+        ("seed: 7", "seed: [", ":4: not YAML"),
+        ("seed: 7", "name: again", ":2: name: this key appears twice"),
+        ("seed: 7", "seed: many", ":2: seed: Expected `int`, got `str`"),
+        ("toys:Sink", "toys:Snk", ":19: stages.sink.stage: no class 'Snk' in .*; did you mean 'Sink'"),
+        ("toys:Sink", "toyz:Sink", ":19: stages.sink.stage: no module 'tests.runner.toyz'; did you mean"),
+        ("toys:Sink", "toys:Number", ":19: stages.sink.stage: .* is not"),
+        ("total: gatherer.total", "total: gatherr.total", ":22: stages.sink.inputs.total: no stage 'gatherr'; did"),
+        (
+            "total: gatherer.total",
+            "total: gatherer.totl",
+            ":22: stages.sink.inputs.total: gatherer has no output 'totl'; did",
+        ),
+        (
+            "total: gatherer.total",
+            "total: worker.answer",
+            ":22: .*total: expected Total, .* is Answer; valid: gatherer.total",
+        ),
+        (
+            "total: gatherer.total",
+            "totl: gatherer.total",
+            ":22: stages.sink.inputs.totl: .*:Sink has no input 'totl'; did you mean 'total'",
+        ),
+        (
+            "total: gatherer.total",
+            "total: gatherer",
+            ":22: stages.sink.inputs.total: 'gatherer' is not of the form stage.port",
+        ),
+        ("{total: gatherer.total}", "{}", r":22: stages.sink.inputs: not connected: total \(Total\)"),
+        ("queue: 8", "queue: 0", ":14: stages.worker.inputs.number.queue: Expected `int` >= 1"),
+        ("queue: 8", "policy: newest", ":14: stages.worker.inputs.number.policy: .*'newest'; valid: block, latest"),
+        ("  watcher:", "  supervisor:", ":23: stages.supervisor: a stage's name is .* none of supervisor"),
+    ],
+)
+def test_a_mistake_in_the_file_is_one_line(tmp_path: Path, old: str, new: str, message: str):
+    with pytest.raises(Refused, match=message) as caught:
+        load(tmp_path, OUT, old=old, new=new)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("sink.pth=x", "--set sink.pth: unknown key 'pth'; did you mean 'path'"),
+        ("snk.path=x", "--set snk.path: no stage 'snk'; did you mean 'sink'"),
+        ("worker.seconds=soon", "--set worker.seconds: Expected `float`, got `str`"),
+        ("splitter.replicas=2", "--set splitter.replicas: .* takes no Part"),
+        ("seed", "--set seed: expected key=value"),
+        ("splitter.parts=${worker.secnds}", "--set splitter.parts: no setting 'worker.secnds'"),
+    ],
+)
+def test_a_mistake_in_a_setting_is_one_line(tmp_path: Path, setting: str, message: str):
+    with pytest.raises(Refused, match=message) as caught:
+        load(tmp_path, OUT, setting)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_value_that_must_be_set_says_how(tmp_path: Path):
+    with pytest.raises(Refused, match=r"graph.yaml:21: stages.sink.config.path: .* --set sink.path="):
+        load(tmp_path)
+
+
+def test_all_mistakes_of_a_kind_are_named_at_once(tmp_path: Path):
+    with pytest.raises(Refused) as caught:
+        load(tmp_path, OUT, "counter.cont=1", "worker.secs=1")
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_settings_have_yaml_types(tmp_path: Path):
+    graph = load(tmp_path, OUT, "counter.count=3", "seed=11", "worker.replicas=3")
+    assert graph.nodes["counter"].config.count == 3
+    assert (graph.seed, graph.nodes["worker"].replicas) == (11, 3)
+
+
+def test_paths_are_relative_to_where_they_were_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shell = tmp_path / "shell"
+    shell.mkdir()
+    monkeypatch.chdir(shell)
+    assert load(tmp_path, OUT).nodes["sink"].config.path == shell / "out.txt"
+    assert load(tmp_path, old="path: ???", new="path: out.txt").nodes["sink"].config.path == tmp_path / "out.txt"
+
+
+def test_settings_fill_each_other_in(tmp_path: Path):
+    graph = load(tmp_path, "sink.path=${counter.count}.txt", "counter.count=4", "splitter.parts=${counter.count}")
+    assert graph.nodes["sink"].config.path.name == "4.txt"
+    assert graph.nodes["splitter"].config.parts == 4
+
+
+def test_json_is_read_back_as_the_same_graph(tmp_path: Path):
+    text = graph_to_json(load(tmp_path, OUT))
+    assert graph_to_json(graph_from_json(text)) == text
+
+
+def test_mermaid_shows_stages_and_types(tmp_path: Path):
+    chart = mermaid(load(tmp_path, OUT))
+    assert 'splitter -->|"Piece"| worker' in chart
+    assert 'supervisor -->|"Restarted"| watcher' in chart
+
+
+def test_the_published_schema_is_the_one_in_force():
+    assert json.loads((ROOT / "runner" / "graph.schema.json").read_text()) == graph_schema()
+
+
+@pytest.mark.parametrize(
+    "path", [TOYS, *ROOT.glob("graph.yaml"), *ROOT.glob("graphs/*.yaml")], ids=lambda path: path.name
+)
+def test_graph_files_satisfy_the_schema(path: Path):
+    jsonschema.validate(yaml.safe_load(path.read_text()), graph_schema())
+
+
+def test_the_command_prints_one_line_and_no_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(tmp_path / "absent.yaml")]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.endswith("absent.yaml: No such file or directory\n")
+    assert captured.out == ""

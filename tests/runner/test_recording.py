@@ -1,0 +1,278 @@
+import io
+import json
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from runner.codec import Envelope, LogLine, Step, envelope, open_envelope, pack
+from runner.container import Container, Growing, is_being_written
+from runner.contract import Refused
+from runner.graph import load_graph
+from runner.info import describe
+from runner.recorder import RecordingWriter
+from runner.recording import Ledger, Recording, Verdict
+from tests.runner.recordings import TOYS, manifest, record_toys
+from tests.runner.toys import Number, Total
+
+FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.fixture(scope="module")
+def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path, verdict = record_toys(tmp_path_factory.mktemp("toys"))
+    assert verdict == Verdict(True)
+    return path
+
+
+def writer(path: Path, refused: list[str] | None = None) -> RecordingWriter:
+    graph = load_graph(TOYS, (f"sink.path={path.with_suffix('.txt')}",))
+    return RecordingWriter(manifest(graph, path), (refused if refused is not None else []).append)
+
+
+def number(sequence: int) -> Envelope:
+    own = f"counter.number#{sequence}"
+    return envelope(Number(value=sequence), id=own, lineage=own, time_ns=sequence, causes=())
+
+
+# ------------------------------------------------------------------------------------ content
+
+
+def test_holds_every_message_and_step(toys: Path):
+    recording = Recording(toys)
+    assert len(recording.messages) == 51
+    assert len(recording.steps) == 40
+    assert not recording.torn
+    assert not recording.damage
+    assert recording.verdict == Verdict(True)
+    assert recording.graph["stages"]["worker"]["replicas"] == 2
+    assert recording.metadata["verdict"]["verdict"] == "COMPLETE"
+
+
+def test_reads_messages_by_id_across_chunks(tmp_path: Path):
+    path = tmp_path / "numbers.mcap"
+    recorder = writer(path)
+    for sequence in range(12):
+        recorder.put(Envelope, pack(number(sequence)))
+        time.sleep(0.06)
+    recorder.close()
+    recording = Recording(path)
+    assert len({message.offset for message in recording.messages.values()}) > 1
+    for sequence in (11, 0, 5):
+        assert open_envelope(Number, recording.envelope(f"counter.number#{sequence}")).value == sequence
+    with pytest.raises(KeyError):
+        recording.envelope("counter.number#99")
+
+
+def test_any_mcap_reader_reads_it(toys: Path):
+    with toys.open("rb") as file:
+        found = list(make_reader(file).iter_messages(topics=["worker/answer"]))
+    assert len(found) == 20
+    schema, channel, message = found[0]
+    assert (channel.topic, channel.message_encoding) == ("worker/answer", "msgpack")
+    assert schema is not None
+    assert (schema.name, schema.encoding) == ("Answer", "jsonschema")
+    assert json.loads(schema.data)["title"] == "Answer"
+    assert message.sequence == 0
+
+
+def test_says_what_ran_where(toys: Path):
+    run = Recording(toys).run
+    assert run["seed"] == "7"
+    assert json.loads(run["settings"])[0].startswith("sink.path=")
+    assert json.loads(run["packages"])["numpy"] == np.__version__
+    assert json.loads(run["machine"])["python"]
+
+
+def test_refuses_to_overwrite(toys: Path):
+    with pytest.raises(Refused, match="cannot be created: File exists"):
+        writer(toys)
+
+
+# ------------------------------------------------------------------------------------ verdict
+
+
+@pytest.mark.parametrize("lost", ["counter.number#2", "worker.answer#7", "gatherer.total#4", "sink.finished#0"])
+def test_a_lost_message_makes_it_incomplete(tmp_path: Path, lost: str):
+    path, verdict = record_toys(tmp_path, keep=lambda record: None if getattr(record, "id", "") == lost else record)
+    assert verdict == Verdict(False, (lost,))
+    assert Recording(path).verdict == verdict
+    assert f"INCOMPLETE: 1 missing: {lost}" in describe(path)
+
+
+def test_a_gap_shows_without_the_journal():
+    ledger = Ledger(frozenset({"worker"}))
+    for id in ("counter.number#0", "counter.number#3", "worker.answer#5"):
+        ledger.message(id)
+    assert ledger.missing() == ("counter.number#1", "counter.number#2")
+
+
+def test_a_message_that_came_twice_is_counted_once(tmp_path: Path):
+    path = tmp_path / "twice.mcap"
+    recorder = writer(path)
+    recorder.put(Envelope, pack(number(0)))
+    recorder.put(Envelope, pack(number(0)))
+    assert recorder.close().complete
+    recording = Recording(path)
+    assert list(recording.messages) == ["counter.number#0"]
+    assert recording.repeated["counter.number#0"] == 1
+
+
+def test_a_malformed_payload_is_refused_with_its_reason(tmp_path: Path):
+    refused: list[str] = []
+    recorder = writer(tmp_path / "malformed.mcap", refused)
+    recorder.put(Envelope, b"\xc1 nonsense")
+    recorder.put(Envelope, pack(number(0)))
+    assert recorder.close().complete
+    assert len(refused) == 1
+    assert "malformed Envelope" in refused[0]
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_process(tmp_path: Path):
+    refused: list[str] = []
+    recorder = writer(tmp_path / "full.mcap", refused)
+    recorder._writer = _FullDisk()  # pyright: ignore
+    recorder.put(Envelope, pack(number(0)))
+    verdict = recorder.close()
+    recorder.put(Envelope, pack(number(1)))
+    assert not verdict.complete
+    assert "No space left on device" in verdict.reason
+    assert "No space left on device" in refused[0]
+
+
+class _FullDisk:
+    def __getattr__(self, name: str):
+        raise OSError(28, "No space left on device")
+
+
+# ------------------------------------------------------------------------------------ torn, damaged, foreign
+
+
+def test_a_torn_recording_is_read_up_to_the_tear(toys: Path, tmp_path: Path):
+    """Without its last 8 bytes, inside the summary, inside the verdict, and inside the last chunk."""
+    content = toys.read_bytes()
+    for cut in (len(content) - 4, len(content) - 600, content.index(b"COMPLETE") + 3):
+        torn = tmp_path / "torn.mcap"
+        torn.write_bytes(content[:cut])
+        recording = Recording(torn)
+        assert recording.torn
+        assert len(recording.messages) == 51
+        assert "INCOMPLETE: torn at byte" in describe(torn)
+
+
+@given(share=st.floats(0, 1))
+@FEW
+def test_a_cut_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path, share: float):
+    content = toys.read_bytes()
+    torn = tmp_path / "cut.mcap"
+    torn.write_bytes(content[: int(share * (len(content) - 1))])
+    try:
+        assert "INCOMPLETE: torn at byte" in describe(torn)
+    except Refused as refused:
+        assert str(refused).startswith(str(torn))
+        assert "\n" not in str(refused)
+
+
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@FEW
+def test_a_flipped_bit_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path, share: float, bit: int):
+    content = bytearray(toys.read_bytes())
+    content[int(share * len(content))] ^= 1 << bit
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    try:
+        describe(damaged)
+        for sealed in Recording(damaged).envelopes():
+            assert sealed.id
+    except Refused as refused:
+        assert "\n" not in str(refused)
+
+
+def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path: Path):
+    path = tmp_path / "damaged.mcap"
+    recorder = writer(path)
+    for sequence in range(10):
+        recorder.put(Envelope, pack(number(sequence)))
+        time.sleep(0.06)
+    recorder.close()
+    content = bytearray(path.read_bytes())
+    content[content.index(b"\x03\x00\x00\x00lz4") + 60] ^= 0xFF
+    path.write_bytes(content)
+    recording = Recording(path)
+    assert "chunk" in str(recording.damage[0])
+    assert "counter.number#0" not in recording.messages
+    assert "counter.number#9" in recording.messages
+    assert not recording.verdict.complete
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(b"", "empty or cut off"), (b"\x89MC", "empty or cut off"), (b"name: toys\nseed: 7\n", "not an MCAP file")],
+)
+def test_refuses_what_is_no_mcap(tmp_path: Path, content: bytes, reason: str):
+    path = tmp_path / "foreign.mcap"
+    path.write_bytes(content)
+    with pytest.raises(Refused, match=reason):
+        Recording(path)
+
+
+def test_refuses_a_foreign_mcap_a_missing_file_and_a_folder(toys: Path, tmp_path: Path):
+    foreign = io.BytesIO()
+    other = Writer(foreign)
+    other.start("ros2")
+    other.finish()
+    path = tmp_path / "foreign.mcap"
+    path.write_bytes(foreign.getvalue())
+    with pytest.raises(Refused, match="no 'run' metadata"):
+        Recording(path)
+    with pytest.raises(Refused, match=r"no such file; recordings in .*: toys\.mcap"):
+        Recording(toys.with_name("nothing.mcap"))
+    with pytest.raises(Refused, match="is a directory"):
+        Recording(tmp_path)
+
+
+# ------------------------------------------------------------------------------------ while it grows
+
+
+def test_a_killed_recorder_loses_no_more_than_the_last_moments(tmp_path: Path):
+    path, copy = tmp_path / "growing.mcap", tmp_path / "killed.mcap"
+    recorder = writer(path)
+    recorder.put(Envelope, pack(number(0)))
+    time.sleep(0.6)
+    recorder.put(Envelope, pack(number(1)))
+    shutil.copy(path, copy)
+    recorder.close()
+    recording = Recording(copy)
+    assert list(recording.messages)[:1] == ["counter.number#0"]
+    assert recording.torn
+
+
+def test_follows_a_recording_until_its_writer_lets_go(tmp_path: Path):
+    path = tmp_path / "growing.mcap"
+    recorder = writer(path)
+    recorder.put(Envelope, pack(number(0)))
+    with path.open("rb") as file:
+        assert is_being_written(file)
+        entries = (record for record in Container(Growing(file), str(path)) if hasattr(record, "topic"))
+        assert next(entries).topic == "counter/number"
+        recorder.put(LogLine, pack(LogLine("counter", 0, "info", "hello", 0)))
+        recorder.put(Step, pack(Step("counter", 0, 0, 0, "source", (), ("counter.number#0",), 0, 0, 0, 0)))
+        assert next(entries).topic == "log/counter"
+        recorder.close()
+        assert [entry.topic for entry in entries] == ["journal/counter"]
+        assert not is_being_written(file)
+
+
+def test_info_counts_rates_and_times(toys: Path):
+    text = describe(toys)
+    assert f"{toys}: COMPLETE" in text
+    assert "graph     toys (seed 7, --set sink.path=" in text
+    row = next(line for line in text.splitlines() if line.startswith("worker/answer"))
+    assert row.split()[1:3] == ["Answer", "20"]
+    assert open_envelope(Total, Recording(toys).envelope("gatherer.total#4")).last

@@ -1,0 +1,30 @@
+"""Scenes for tests of planning: the robot at its table with a few catalogue objects."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from stages.devices import fetch, tabletop
+from stages.perception.poses import pose
+from stages.planning.collision import CollisionWorld
+from stages.scene.catalogue import Catalogue, Floats
+
+CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"
+
+
+@lru_cache(maxsize=1)
+def catalogue() -> Catalogue:
+    return Catalogue.load(CATALOGUE_FILE)
+
+
+def standing(name: str, x: float, y: float, *, yaw: float = 0.0, height: float = tabletop.TABLE.height) -> Floats:
+    """T_base_object of an upright object."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    bottom = catalogue()[name].bounds[0, 2]
+    return pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([x, y, height - bottom]))
+
+
+def world(carried: str, **poses: Floats) -> CollisionWorld:
+    objects = {name: (catalogue()[name], T) for name, T in poses.items()}
+    return CollisionWorld(fetch.robot_model(), tabletop.TABLE, objects, carried=carried)

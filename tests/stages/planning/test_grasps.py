@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from stages.planning.grasps import distinct_grasps, hand_poses
+from tests.stages.planning.scenes import catalogue, standing
+
+GRASPABLE = [name for name, entry in catalogue().objects.items() if entry.grasps]
+
+
+@pytest.mark.parametrize("name", GRASPABLE)
+def test_hand_poses_are_the_grasp_up_to_a_symmetry(name: str) -> None:
+    entry, T = catalogue()[name], standing(name, 0.6, 0.1, yaw=0.7)
+    symmetries = entry.symmetries.transforms(np.deg2rad(22.5))
+    for grasp in distinct_grasps(entry):
+        poses = hand_poses(entry, grasp, T)
+        assert poses
+        for hand in poses:
+            np.testing.assert_allclose(hand.T_base_hand, T @ hand.T_object_hand, atol=1e-9)
+            used = hand.T_object_hand @ np.linalg.inv(grasp.T_object_grasp)
+            assert min(np.abs(used - S).max() for S in symmetries) < 1e-6
+            assert hand.T_base_hand[2, 0] < 0.21
+
+
+@pytest.mark.parametrize("name", GRASPABLE)
+def test_the_pregrasp_lies_behind_the_grasp(name: str) -> None:
+    entry = catalogue()[name]
+    for grasp in distinct_grasps(entry):
+        for hand in hand_poses(entry, grasp, standing(name, 0.6, 0.1)):
+            back = np.linalg.inv(hand.T_base_hand) @ hand.T_base_prehand
+            assert back[0, 3] < -0.05
+
+
+def test_a_round_object_keeps_one_grasp_of_a_kind_and_turns_it() -> None:
+    can = catalogue()["soup_can"]
+    top = [grasp for grasp in distinct_grasps(can) if grasp.kind == "top"]
+    assert len(top) == 1
+    assert len(hand_poses(can, top[0], standing("soup_can", 0.6, 0.0))) == 16
+
+
+def test_side_grasps_away_from_the_robot_come_first() -> None:
+    can = catalogue()["soup_can"]
+    side = next(grasp for grasp in distinct_grasps(can) if grasp.kind == "side")
+    approach = hand_poses(can, side, standing("soup_can", 0.6, 0.0))[0].T_base_hand[:3, 0]
+    assert approach[0] > 0.99

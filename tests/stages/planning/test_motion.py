@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stages.devices import fetch
+from stages.planning.collision import CollisionWorld
+from stages.planning.motion import (
+    POSITION_TOLERANCE,
+    ROTATION_TOLERANCE,
+    free_motion,
+    is_motion_free,
+    restarts,
+    solve_ik,
+    straight_motion,
+    time_parameterise,
+)
+from stages.planning.pick_place import raised
+from tests.stages.planning.scenes import standing, world
+
+HOME = fetch.robot_model().home
+
+
+@pytest.fixture(scope="module")
+def scene() -> CollisionWorld:
+    return world("cup", cup=standing("cup", 0.6, 0.0), cereal_box=standing("cereal_box", 0.6, 0.2, yaw=0.3))
+
+
+def above_table(x: float, y: float) -> np.ndarray:
+    down = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = down, [x, y, 0.95]
+    return T
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**31))
+def test_ik_finds_the_pose_that_fk_reports(scene: CollisionWorld, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Away from the limits, where the way from a neighbour may be blocked.
+    q = rng.uniform(0.9 * scene.lower + 0.1 * scene.upper, 0.1 * scene.lower + 0.9 * scene.upper)
+    target = scene.hand(q)
+    near = np.clip(q + rng.normal(scale=0.1, size=len(q)), scene.lower, scene.upper)
+    found = solve_ik(scene, target, seeds=restarts(scene, rng, near, extra=20), free=False)
+    assert found is not None
+    assert np.abs(scene.hand(found)[:3, 3] - target[:3, 3]).max() < POSITION_TOLERANCE
+    assert np.abs(scene.hand(found)[:3, :3] - target[:3, :3]).max() < 2 * ROTATION_TOLERANCE
+    assert ((found >= scene.lower) & (found <= scene.upper)).all()
+
+
+def test_ik_gives_up_out_of_reach(scene: CollisionWorld) -> None:
+    assert solve_ik(scene, above_table(2.0, 0.0), seeds=iter([HOME])) is None
+
+
+def test_jacobian_is_the_derivative_of_the_hand(scene: CollisionWorld) -> None:
+    q = HOME + 0.1
+    scene.hand(q)
+    J = scene.jacobian()
+    for k in range(len(q)):
+        dq = np.zeros(len(q))
+        dq[k] = 1e-6
+        numeric = (scene.hand(q + dq)[:3, 3] - scene.hand(q - dq)[:3, 3]) / 2e-6
+        np.testing.assert_allclose(J[:3, k], numeric, atol=1e-6)
+
+
+def test_straight_motion_stays_on_the_line(scene: CollisionWorld) -> None:
+    start = solve_ik(scene, above_table(0.6, -0.2), seeds=restarts(scene, np.random.default_rng(0), HOME, extra=10))
+    assert start is not None
+    path = straight_motion(scene, start, raised(scene.hand(start), -0.08))
+    assert path is not None
+    positions = np.array([scene.hand(q)[:3, 3] for q in path])
+    np.testing.assert_allclose(positions[:, :2], np.broadcast_to(positions[0, :2], (len(path), 2)), atol=2e-3)
+    assert positions[-1, 2] == pytest.approx(positions[0, 2] - 0.08, abs=2e-3)
+
+
+def test_straight_motion_refuses_to_hit_the_table(scene: CollisionWorld) -> None:
+    start = solve_ik(scene, above_table(0.6, -0.2), seeds=restarts(scene, np.random.default_rng(0), HOME, extra=10))
+    assert start is not None
+    assert straight_motion(scene, start, raised(scene.hand(start), -0.3)) is None
+
+
+def test_free_motion_is_collision_free_and_repeatable(scene: CollisionWorld) -> None:
+    goal = solve_ik(scene, above_table(0.6, 0.35), seeds=restarts(scene, np.random.default_rng(1), HOME, extra=20))
+    assert goal is not None
+    first, second = (free_motion(scene, HOME, goal, np.random.default_rng(5)) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_allclose(first[[0, -1]], [HOME, goal])
+    assert is_motion_free(scene, first)
+    timed = time_parameterise(scene.robot, first)
+    assert all(scene.is_free(q) for q in timed.positions)
+
+
+def test_trajectories_respect_the_limits() -> None:
+    robot = fetch.robot_model()
+    waypoints = HOME + np.array([[0.0], [0.3], [-0.2], [0.4]]) * np.array([0.1, 1, 1, 1, 1, 1, 1, 1])
+    waypoints[:, 0] = HOME[0] - np.abs(waypoints[:, 0] - HOME[0])
+    motion = time_parameterise(robot, waypoints, speed=0.5)
+    assert (np.abs(motion.velocities) <= 0.5 * robot.velocity * 1.02).all()
+    np.testing.assert_allclose(motion.velocities[[0, -1]], 0, atol=1e-6)
+    np.testing.assert_allclose(motion.positions[[0, -1]], waypoints[[0, -1]], atol=1e-6)
+    assert (np.diff(motion.times) > 0).all()
+    assert motion.times[-1] < 10
+
+
+def test_the_held_object_collides_too(scene: CollisionWorld) -> None:
+    target = above_table(0.6, 0.2)
+    target[2, 3] = 0.70 + 0.150 + 0.06
+    q = solve_ik(scene, target, seeds=restarts(scene, np.random.default_rng(2), HOME, extra=20))
+    assert q is not None
+    below_hand = np.eye(4)
+    below_hand[:3, :3] = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])
+    below_hand[0, 3] = 0.05
+    with scene.holding(below_hand, width=0.078):
+        assert not scene.is_free(q)
+        assert ("cereal_box", "held") in scene.contacts(q)
+        with scene.resting("cereal_box"):
+            assert scene.is_free(q)
+    assert scene.is_free(q)

@@ -1,0 +1,135 @@
+"""Relations of hand-made scenes: what is on, in and clear, and that the estimate's noise does not change it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stages.scene.standing import Standing
+from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, stances
+
+SCENES = {
+    "breakfast": (
+        breakfast(),
+        {
+            "on(tray, table)",
+            "in(bowl, tray)",
+            "in(cup, bowl)",
+            "in(tea_box, tray)",
+            "on(tuna_can, tea_box)",
+            "on(soup_can, table)",
+        },
+    ),
+    "three stacked, the lowest widest": (
+        Layout()
+        .put("cereal_box", 0, 0, resting=1)
+        .put("sponge", 0, 0.01, on="cereal_box")
+        .put("salt_shaker", 0, 0, on="sponge"),
+        {"on(cereal_box, table)", "on(sponge, cereal_box)", "on(salt_shaker, sponge)"},
+    ),
+    "three stacked in a tray": (
+        Layout()
+        .put("tray", 0, 0)
+        .put("tea_box", -0.1, 0, on="tray", resting=1)
+        .put("tuna_can", 0, 0, on="tea_box")
+        .put("salt_shaker", 0, 0, on="tuna_can"),
+        {"on(tray, table)", "in(tea_box, tray)", "on(tuna_can, tea_box)", "on(salt_shaker, tuna_can)"},
+    ),
+    "on a plate in a tray": (
+        Layout().put("tray", 0, 0).put("plate", -0.05, 0, on="tray").put("mug", 0.01, 0.02, on="plate"),
+        {"on(tray, table)", "in(plate, tray)", "on(mug, plate)"},
+    ),
+    "bottles that lie": (
+        Layout().put("water_bottle", 0, 0, resting=1).put("sauce_bottle", 0.2, 0, resting=1).put("sponge", 0.3, 0.2),
+        {"on(water_bottle, table)", "on(sauce_bottle, table)", "on(sponge, table)"},
+    ),
+    "a plate on a cup": (
+        Layout().put("cup", 0, 0).put("plate", 0, 0).put("soup_can", 0.2, 0),
+        {"on(cup, table)", "in(plate, cup)", "on(soup_can, table)"},
+    ),
+}
+SCENES["a plate on a cup"][0].poses["plate"][2, 3] += 0.095
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_carries_what(name: str):
+    layout, expected = SCENES[name]
+    assert carried(layout.graph()) == expected
+
+
+@given(st.sampled_from(sorted(SCENES)), st.integers(0, 2**32 - 1))
+@settings(max_examples=80, deadline=None)
+def test_noise_of_the_estimate_changes_nothing(name: str, seed: int):
+    layout, expected = SCENES[name]
+    noisy = layout.disturbed(np.random.default_rng(seed), metres=0.005, degrees=3)
+    assert carried(noisy.graph()) == expected
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-0.3, 0.3))
+@settings(max_examples=20, deadline=None)
+def test_where_the_scene_stands_changes_nothing(yaw: float, x: float):
+    layout, expected = SCENES["breakfast"]
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, 0, yaw]).as_matrix()
+    T[0, 3] = x
+    assert carried(layout.moved(T).graph()) == expected
+
+
+def test_clear_is_what_carries_nothing():
+    clear = {text for text in asserted(breakfast().graph()) if text.startswith("clear")}
+    assert clear == {"clear(cup)", "clear(tuna_can)", "clear(soup_can)"}
+
+
+def test_everything_exists():
+    graph = breakfast().graph()
+    assert {f"exist({item.name})" for item in graph.objects} <= asserted(graph)
+
+
+def test_the_order_of_the_objects_does_not_matter():
+    layout, expected = SCENES["three stacked in a tray"]
+    reversed_layout = Layout(dict(reversed(layout.poses.items())))
+    assert carried(reversed_layout.graph()) == expected
+
+
+def test_an_upturned_bowl_carries_on_rather_than_in():
+    layout = Layout().put("bowl", 0, 0)
+    layout.poses["bowl"][:3, :3] = np.diag([1.0, -1.0, -1.0])
+    layout.poses["bowl"][2, 3] = 0.03
+    layout.put("salt_shaker", 0, 0, on="bowl")
+    assert "on(salt_shaker, bowl)" in carried(layout.graph())
+
+
+def test_an_object_that_leans_on_another_is_supported_by_it():
+    layout = Layout().put("cereal_box", 0, 0).put("sponge", 0.0, 0.0)
+    lean = Rotation.from_rotvec([0, np.deg2rad(-50), 0]).as_matrix()
+    layout.poses["sponge"][:3, :3] = lean
+    layout.poses["sponge"][:3, 3] = [0.03, 0, 0.16]
+    assert "on(sponge, cereal_box)" in carried(layout.graph())
+
+
+def test_an_object_that_leans_on_nothing_is_on_the_table():
+    layout = Layout().put("mug", 0, 0)
+    layout.poses["mug"][:3, :3] = Rotation.from_rotvec([0, np.deg2rad(40), 0]).as_matrix()
+    assert carried(layout.graph()) == {"on(mug, table)"}
+
+
+def test_an_object_without_anything_below_is_on_the_table():
+    layout = Layout().put("tea_box", 0, 0).put("cup", 0.3, 0)
+    layout.poses["cup"][2, 3] += 0.05
+    assert "on(cup, table)" in carried(layout.graph())
+
+
+def test_height_and_regions_ignore_a_few_degrees_of_tilt():
+    straight, tilted = np.eye(4), np.eye(4)
+    tilted[:3, :3] = Rotation.from_rotvec([0.05, -0.04, 0]).as_matrix()
+    a, b = (Standing.at("tray", stances("tray"), T) for T in (straight, tilted))
+    assert a.stance.height == pytest.approx(catalogue()["tray"].dimensions[2])
+    assert b.z_bottom == pytest.approx(a.z_bottom)
+    assert b.bottom == pytest.approx(a.bottom, abs=1e-3)
+
+
+def test_a_bowl_carries_a_wide_bottom_higher_than_a_narrow_one():
+    bowl = Standing.at("bowl", stances("bowl"), np.eye(4))
+    cup, shaker = (Standing.at(name, stances(name), np.eye(4)) for name in ("cup", "salt_shaker"))
+    assert bowl.z_floor < bowl.rest_height(shaker.bottom) < bowl.rest_height(cup.bottom) < bowl.z_top

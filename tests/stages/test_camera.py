@@ -1,0 +1,150 @@
+"""The camera stages: frames with noise from the step's generator, data sets to the end, clear refusals."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stages.scene
+from runner import codec
+from runner.contract import Refused
+from runner.graph import load_graph
+from runner.ports import inspect_stage
+from runner.recorder import RecordingWriter
+from runner.step import StepContext
+from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, SimulatedCamera
+from stages.devices import fetch
+from stages.devices.tabletop import TABLE
+from stages.messages import Frame, Snapshot
+from tests.runner.recordings import manifest
+
+BUILT_IN = Path(stages.scene.__file__).parent / "catalogue.yaml"
+DATA = Path(__file__).parents[3] / "shared" / "data"
+# A recording keeps its file open as long as it lives.
+lives_on = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../shared/data are absent")
+
+
+def context(seed: int = 0) -> StepContext:
+    return StepContext(time_ns=0, seed=seed, directory=Path(), log=lambda *_: None)
+
+
+def snapshot() -> Snapshot:
+    T = np.eye(4)
+    T[:3, 3] = 0.7, 0.0, TABLE.height + 0.05
+    return Snapshot(
+        names=("soup_can",),
+        T_base_objects=T[None],
+        joint_names=tuple(fetch.HOME),
+        joint_positions=np.array(list(fetch.HOME.values())),
+        time=1.5,
+        purpose="goal",
+    )
+
+
+def test_simulated_frames_differ_by_the_noise_alone() -> None:
+    camera = SimulatedCamera(SimulatedCamera.Config(catalogue=BUILT_IN))
+    first, again, other = (camera.on_snapshot(snapshot(), context(seed)) for seed in (1, 1, 2))
+    camera.close()
+    np.testing.assert_array_equal(first.depth, again.depth)
+    np.testing.assert_array_equal(first.rgb, again.rgb)
+    assert (first.depth != other.depth).any()
+    assert [frame.index for frame in (first, again, other)] == [0, 1, 2]
+    assert (first.name, first.total, first.n_objects) == ("goal", 0, None)
+    assert first.robot_mask is not None and first.T_base_camera is not None
+    assert 0.9 < (first.depth > 0).mean() < 1.0
+
+
+def test_simulated_frame_without_noise_is_complete() -> None:
+    camera = SimulatedCamera(SimulatedCamera.Config(catalogue=BUILT_IN, noise=False))
+    frame = camera.on_snapshot(snapshot(), context())
+    camera.close()
+    assert (frame.depth > 0).all()
+    assert codec.decode(Frame, codec.encode(frame)).name == "goal"
+
+
+@needs_data
+def test_data_set_camera_gives_each_target_image_once() -> None:
+    camera = DatasetCamera(DatasetCamera.Config(dataset=DATA / "ycb-real"))
+    frames = list(camera.source(context()))
+    assert [(frame.index, frame.total, frame.scene_id) for frame in frames] == [(i, 5, i + 1) for i in range(5)]
+    assert [frame.n_objects for frame in frames] == [5, 3, 3, 1, 1]
+    assert all(frame.T_base_camera is None and frame.robot_mask is None for frame in frames)
+    codec.encode(frames[0])
+
+
+@needs_data
+def test_data_set_camera_stops_at_its_limit() -> None:
+    camera = DatasetCamera(DatasetCamera.Config(dataset=DATA / "ycb-real", limit=2))
+    assert [frame.total for frame in camera.source(context())] == [2, 2]
+
+
+def test_negative_limit_is_refused() -> None:
+    with pytest.raises(Refused, match=r"camera\.limit = -1"):
+        DatasetCamera.Config(dataset=Path(), limit=-1)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pyrealsense2") is not None, reason="pyrealsense2 is installed")
+def test_realsense_without_its_library_says_what_to_install() -> None:
+    with pytest.raises(Refused, match=r"pip install 'scene-programming\[realsense\]'"):
+        RealSenseCamera(RealSenseCamera.Config())
+
+
+def test_realsense_settings_are_checked() -> None:
+    with pytest.raises(Refused, match=r"camera\.fps = 0: must be at least 1"):
+        RealSenseCamera.Config(fps=0)
+
+
+def record(folder: Path, frames: list[Frame]) -> Path:
+    """A recording of a graph whose one stage is a camera that gave ``frames``."""
+    (folder / "graph.yaml").write_text(
+        "name: look\nseed: 0\nstages:\n  camera: {stage: 'stages.camera:DatasetCamera', config: {dataset: x}}\n"
+    )
+    path = folder / "look.mcap"
+    writer = RecordingWriter(manifest(load_graph(folder / "graph.yaml", ()), path), print)
+    for number, frame in enumerate(frames):
+        id = f"camera.frame#{number}"
+        sealed = codec.envelope(frame, id=id, lineage=id, time_ns=number, causes=())
+        writer.put(codec.Envelope, codec.pack(sealed))
+    writer.close()
+    return path
+
+
+def frame(name: str) -> Frame:
+    return Frame(
+        rgb=np.full((4, 6, 3), 7, np.uint8),
+        depth=np.ones((4, 6), np.float32),
+        K=np.eye(3),
+        T_base_camera=None,
+        robot_mask=None,
+        name=name,
+        index=0,
+        total=0,
+    )
+
+
+@lives_on
+def test_recorded_camera_gives_the_frames_again_counted_anew(tmp_path: Path) -> None:
+    path = record(tmp_path, [frame("goal"), frame("start")])
+    camera = RecordedCamera(RecordedCamera.Config(recording=path))
+    frames = list(camera.source(context()))
+    assert [(f.name, f.index, f.total) for f in frames] == [("goal", 0, 2), ("start", 1, 2)]
+    np.testing.assert_array_equal(frames[1].rgb, frame("start").rgb)
+
+
+@lives_on
+def test_recording_without_frames_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match=r"look\.mcap: holds no message of type Frame; there are none at all"):
+        RecordedCamera(RecordedCamera.Config(recording=record(tmp_path, [])))
+
+
+def test_missing_recording_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match=r"song\.mcap"):
+        RecordedCamera(RecordedCamera.Config(recording=tmp_path / "song.mcap"))
+
+
+@pytest.mark.parametrize("stage", [SimulatedCamera, DatasetCamera, RecordedCamera, RealSenseCamera])
+def test_cameras_are_devices_that_give_frames(stage: type) -> None:
+    assert stage.device
+    assert inspect_stage(stage).outputs == {"frame": Frame}

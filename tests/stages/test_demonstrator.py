@@ -1,0 +1,243 @@
+"""The demonstration's state machine, driven with the messages its neighbours send."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from runner.contract import Message, Refused
+from stages.demonstrator import Demonstrator, change_of_plan
+from stages.messages import (
+    Arrangement,
+    Goal,
+    LookRequest,
+    RobotState,
+    SceneGraph,
+    Task,
+    Transfer,
+    TransferRequest,
+    Verdict,
+)
+from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
+
+GOAL = scene({"tray": "table", "cup": "tray", "soup_can": "table"}, beside={"soup_can": "tray"})
+START = scene({"tray": "table", "soup_can": "table", "cup": "soup_can"}, beside={})
+STEP = transfer("cup", "soup_can", "tray")
+STILL = RobotState(joint_names=(), positions=np.zeros(0), gripper_width=0.1, time=0.0)
+
+
+class Episode:
+    """A demonstrator and the messages it has sent."""
+
+    def __init__(self, **settings: object) -> None:
+        self.stage = Demonstrator(Demonstrator.Config(catalogue=CATALOGUE, **settings))  # type: ignore[arg-type]
+        self.ctx = Recorded()
+        self.sent: list[Message] = []
+
+    def take(self, result: Message | Iterator[Message] | None) -> list[Message]:
+        new = [] if result is None else [result] if isinstance(result, Message) else list(result)
+        self.sent += new
+        return new
+
+    def arranged(self) -> list[Message]:
+        return self.take(self.stage.on_robot_state(STILL, self.ctx))
+
+    def seen(self, graph: SceneGraph) -> list[Message]:
+        return self.take(self.stage.on_scene_graph(graph, self.ctx))
+
+    def planned(self, *transfers: Transfer, **fields: str) -> list[Message]:
+        return self.take(self.stage.on_plan(plan(*transfers, **fields), self.ctx))
+
+    def ended(self, number: int, item: Transfer, **fields: str) -> list[Message]:
+        return self.take(self.stage.on_outcome(outcome(number, item, **fields), self.ctx))
+
+    def until_task(self, goal: SceneGraph = GOAL, start: SceneGraph = START) -> Task:
+        """Everything up to the first request for a plan."""
+        self.take(self.stage.on_start(self.ctx))
+        self.arranged()
+        self.seen(goal)
+        self.arranged()
+        (task,) = self.seen(start)
+        assert isinstance(task, Task)
+        return task
+
+    def until_transfer(self) -> TransferRequest:
+        self.until_task()
+        (request,) = self.planned(STEP)
+        assert isinstance(request, TransferRequest)
+        return request
+
+
+def the_verdict(messages: list[Message]) -> Verdict:
+    (verdict,) = messages
+    assert isinstance(verdict, Verdict)
+    return verdict
+
+
+def test_shows_disturbs_and_restores_a_goal() -> None:
+    episode = Episode()
+    request = episode.until_transfer()
+    assert [type(message) for message in episode.sent] == [
+        Arrangement, LookRequest, Goal, Arrangement, LookRequest, Task, TransferRequest,
+    ]  # fmt: skip
+    assert request.transfer == STEP and request.scene is START and request.number == 1
+    (look,) = episode.ended(1, STEP)
+    assert look == LookRequest(purpose="after transfer 1")
+    verdict = the_verdict(episode.seen(GOAL))
+    assert verdict.success and not verdict.violated and len(verdict.satisfied) == len(GOAL.assertions)
+    assert (verdict.looks, verdict.plans, verdict.transfers) == (3, 1, 1)
+
+
+def test_remembers_the_goal_as_pddl_by_name() -> None:
+    episode = Episode(goal_name="tea-time")
+    episode.until_task()
+    (goal,) = [message for message in episode.sent if isinstance(message, Goal)]
+    assert goal.name == "tea-time" and goal.scene is GOAL
+    assert "(in cup tray)" in goal.pddl and "tea-time" in goal.pddl
+
+
+def test_a_start_that_is_the_goal_needs_no_plan() -> None:
+    episode = Episode()
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    episode.seen(GOAL)
+    episode.arranged()
+    assert the_verdict(episode.seen(GOAL)).success
+
+
+def test_robot_states_of_motions_are_not_arrangements() -> None:
+    episode = Episode()
+    episode.until_transfer()
+    assert episode.arranged() == []
+    episode.ended(1, STEP)
+    assert episode.arranged() == []
+
+
+def test_a_scene_nobody_asked_for_is_ignored() -> None:
+    episode = Episode()
+    episode.until_transfer()
+    assert episode.seen(GOAL) == []
+
+
+def test_a_refused_plan_is_the_planners_verdict() -> None:
+    episode = Episode(repeats=0)
+    episode.until_task()
+    verdict = the_verdict(episode.planned(status="refused", reason="no action frees spoon"))
+    assert not verdict.success and verdict.failed_stage == "planner" and "no action frees spoon" in verdict.reason
+    assert verdict.violated
+
+
+def test_a_refusal_is_looked_at_again_before_it_counts() -> None:
+    episode = Episode(repeats=1)
+    episode.until_task()
+    assert episode.planned(status="refused", reason="cup is on itself") == [LookRequest(purpose="start, look 2")]
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task)
+    assert the_verdict(episode.planned(status="refused", reason="cup is on itself")).plans == 2
+
+
+def test_a_failed_transfer_is_tried_again_then_avoided() -> None:
+    episode = Episode(tries=2)
+    episode.until_transfer()
+    episode.ended(1, STEP, failed_stage="grasp", reason="cup slipped")
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.avoid == ()
+    episode.planned(STEP)
+    assert "plan 2 (kept): cup to tray" in episode.ctx.lines
+    episode.ended(2, STEP, failed_stage="grasp", reason="cup slipped")
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.avoid == (STEP.key,)
+
+
+def test_a_transfer_that_misses_its_relation_counts_as_failed() -> None:
+    episode = Episode(tries=1)
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.avoid == (STEP.key,)
+
+
+def test_no_way_left_after_failures_blames_the_executor() -> None:
+    episode = Episode(tries=1, repeats=0)
+    episode.until_transfer()
+    episode.ended(1, STEP, failed_stage="ik", reason="no grasp of cup is reachable")
+    episode.seen(START)
+    verdict = the_verdict(episode.planned(status="refused", reason="every plan is avoided"))
+    assert verdict.failed_stage == "executor" and "ik: no grasp of cup is reachable" in verdict.reason
+
+
+def test_an_object_that_is_not_seen_is_looked_for_then_named() -> None:
+    episode = Episode(repeats=1)
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    without_cup = scene({"tray": "table", "soup_can": "table"})
+    assert episode.seen(without_cup) == [LookRequest(purpose="after transfer 1, look 2")]
+    verdict = the_verdict(episode.seen(without_cup))
+    assert verdict.failed_stage == "perception" and "not seen: cup" in verdict.reason
+    assert "exist(cup)" in [str(item) for item in verdict.violated]
+
+
+def test_an_object_found_on_the_second_look_goes_on() -> None:
+    episode = Episode(repeats=1)
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    episode.seen(scene({"tray": "table", "soup_can": "table"}))
+    assert the_verdict(episode.seen(GOAL)).success
+
+
+def test_a_goal_with_too_few_objects_is_not_remembered() -> None:
+    episode = Episode(n_objects=4, repeats=1)
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    assert episode.seen(GOAL) == [LookRequest(purpose="goal, look 2")]
+    verdict = the_verdict(episode.seen(GOAL))
+    assert verdict.failed_stage == "perception" and "3 of 4 objects" in verdict.reason
+    assert not verdict.satisfied and not verdict.violated
+
+
+def test_an_episode_that_never_succeeds_ends() -> None:
+    episode = Episode(max_transfers=5)
+    episode.until_task()
+    for number in range(1, 6):
+        episode.planned(STEP)
+        episode.ended(number, STEP)
+        answer = episode.seen(START)
+    verdict = the_verdict(answer)
+    assert verdict.failed_stage == "executor" and verdict.transfers == 5 and "5 transfers" in verdict.reason
+
+
+def test_plans_that_keep_changing_end() -> None:
+    episode = Episode(max_replans=2)
+    episode.until_task()
+    for number in range(1, 4):
+        step = transfer(f"cup_{number}", "table", "tray")
+        assert isinstance(episode.planned(step)[0], TransferRequest)
+        episode.ended(number, step, failed_stage="grasp", reason="slipped")
+        episode.seen(START)
+    verdict = the_verdict(episode.planned(transfer("cup_4", "table", "tray")))
+    assert verdict.failed_stage == "planner" and "replaced 3 times" in verdict.reason
+
+
+def test_after_the_verdict_nothing_happens() -> None:
+    episode = Episode()
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    episode.seen(GOAL)
+    assert [*episode.arranged(), *episode.seen(START), *episode.planned(STEP), *episode.ended(1, STEP)] == []
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "change"),
+    [("ab", "ab", "kept"), ("ab", "b", "repaired"), ("ab", "cab", "repaired"), ("ab", "ba", "replaced")],
+)
+def test_says_how_a_plan_changed(before: str, after: str, change: str) -> None:
+    def steps(names: str) -> list[Transfer]:
+        return [transfer(name, "table", "tray") for name in names]
+
+    assert change_of_plan(steps(before), steps(after)) == change
+
+
+@pytest.mark.parametrize("bad", [{"tries": 0}, {"max_transfers": 0}, {"goal_name": "../x"}, {"repeats": -1}])
+def test_refuses_bad_settings(bad: dict[str, object]) -> None:
+    with pytest.raises(Refused, match=rf"demonstrator\.{next(iter(bad))}="):
+        Demonstrator.Config(catalogue=CATALOGUE, **bad)  # type: ignore[arg-type]

@@ -1,0 +1,162 @@
+"""The detector stages: what they emit, that they repeat themselves exactly, and how well the network sees."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runner.contract import Level, Refused
+from stages.detector import Detector, RecordedDetections
+from stages.devices.detector_data import examples
+from stages.messages import Candidates, Frame
+from stages.perception.detection_evaluation import evaluate
+from stages.perception.detection_network import DetectionNetwork
+from stages.scene.catalogue import Catalogue
+
+ROOT = Path(__file__).parents[2]
+CATALOGUE = ROOT / "stages/scene/catalogue.yaml"
+
+
+@dataclass
+class Log:
+    """As much of a step's context as the detectors use."""
+
+    lines: list[tuple[str, Level]] = field(default_factory=list[tuple[str, Level]])
+
+    def log(self, text: str, *, level: Level = "info") -> None:
+        self.lines.append((text, level))
+
+
+def frame(rgb: np.ndarray, *, scene_id: int = 0, image_id: int = 0) -> Frame:
+    return Frame(
+        rgb=rgb,
+        depth=np.zeros(rgb.shape[:2], np.float32),
+        K=np.eye(3),
+        T_base_camera=None,
+        robot_mask=None,
+        name="test",
+        index=0,
+        total=1,
+        scene_id=scene_id,
+        image_id=image_id,
+    )
+
+
+@pytest.fixture(scope="module")
+def image() -> Iterator[np.ndarray]:
+    made = examples(Catalogue.load(CATALOGUE), layouts=1, views=1, seed=9, like_robot=True)
+    yield next(made).image
+    made.close()
+
+
+def candidates(image: np.ndarray, **settings: Any) -> Candidates:
+    message = Detector(Detector.Config(**settings)).on_frame(frame(image), Log())  # type: ignore[arg-type]
+    assert isinstance(message, Candidates)
+    return message
+
+
+def test_candidates_carry_their_best_label_and_come_best_first(image: np.ndarray) -> None:
+    message = candidates(image)
+    assert len(message.candidates) >= 3
+    assert message.labels == tuple(Catalogue.load(CATALOGUE).objects)
+    assert message.confidences.shape == (len(message.candidates), len(message.labels))
+    for candidate, row in zip(message.candidates, message.confidences, strict=True):
+        assert candidate.label == message.labels[int(row.argmax())]
+        assert candidate.confidence == row.max()
+        assert row.sum() <= 1 + 1e-9
+    scores = [candidate.confidence for candidate in message.candidates]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_settings_limit_boxes_and_labels(image: np.ndarray) -> None:
+    assert len(candidates(image, threshold=0.05, max_boxes=2).candidates) == 2
+    message = candidates(image, labels=("cup", "tray"))
+    assert message.labels == ("cup", "tray")
+    assert {candidate.label for candidate in message.candidates} <= {"cup", "tray"}
+
+
+def test_objects_known_to_be_there_are_doubted_rather_than_missed(image: np.ndarray) -> None:
+    sure = candidates(image).candidates
+    assert len(candidates(image, expected=len(sure)).candidates) == len(sure)
+    doubtful = candidates(image, expected=len(sure) + 1, floor=0.001).candidates
+    assert len(doubtful) > len(sure)
+    assert [c.label for c in doubtful[: len(sure)]] == [c.label for c in sure]
+
+
+def test_an_image_without_anything_has_no_candidates() -> None:
+    message = candidates(np.full((480, 640, 3), 128, np.uint8))
+    assert message.candidates == () and message.confidences.shape == (0, 15)
+
+
+def test_another_process_detects_the_same_to_the_last_bit(image: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "image.npy", image)
+    script = (
+        "import sys, numpy as np; from tests.stages.test_detector import candidates;"
+        "m = candidates(np.load(sys.argv[1]));"
+        "print(m.confidences.tobytes().hex() + ''.join(c.box.tobytes().hex() for c in m.candidates))"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "image.npy")]
+    other = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    here = candidates(image)
+    boxes = "".join(candidate.box.tobytes().hex() for candidate in here.candidates)
+    assert other.stdout.strip() == here.confidences.tobytes().hex() + boxes
+
+
+def test_bad_settings_are_refused_with_the_valid_choices(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match=r"threshold = 1\.5: must lie between 0 and 1"):
+        Detector.Config(threshold=1.5)
+    with pytest.raises(Refused, match=r"floor = 0\.4: must lie above 0 and up to threshold = 0\.3"):
+        Detector.Config(floor=0.4)
+    with pytest.raises(Refused, match=r"max_boxes = 0"):
+        Detector.Config(max_boxes=0)
+    with pytest.raises(Refused, match=r"does not know fork \(it knows tray, "):
+        Detector(Detector.Config(labels=("fork", "cup")))
+    with pytest.raises(Refused, match=r"absent\.safetensors"):
+        Detector(Detector.Config(weights=tmp_path / "absent.safetensors"))
+
+
+def recorded(tmp_path: Path, entries: list[dict[str, Any]]) -> RecordedDetections:
+    path = tmp_path / "detections.json"
+    path.write_text(json.dumps(entries))
+    return RecordedDetections(RecordedDetections.Config(detections=path, catalogue=CATALOGUE))
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    common = {"scene_id": 1, "image_id": 2, "category_id": 4, "score": 0.5, "bbox": [10, 20, 30, 40]}
+    return common | changes
+
+
+def test_recorded_detections_answer_each_image_in_file_order(tmp_path: Path) -> None:
+    stage = recorded(tmp_path, [entry(), entry(image_id=3), entry(category_id=1, score=0.9)])
+    message = stage.on_frame(frame(np.zeros((4, 4, 3), np.uint8), scene_id=1, image_id=2), Log())  # type: ignore[arg-type]
+    assert [(one.label, one.confidence) for one in message.candidates] == [("cup", 0.5), ("tray", 0.9)]
+    np.testing.assert_array_equal(message.candidates[0].box, [10, 20, 40, 60])
+    np.testing.assert_array_equal(message.confidences.max(axis=1), [0.5, 0.9])
+
+
+def test_an_image_that_the_file_lacks_is_empty_and_says_so(tmp_path: Path) -> None:
+    log = Log()
+    stage = recorded(tmp_path, [entry()])
+    message = stage.on_frame(frame(np.zeros((4, 4, 3), np.uint8), scene_id=9, image_id=9), log)  # type: ignore[arg-type]
+    assert message.candidates == () and message.confidences.shape == (0, 15)
+    assert log.lines == [("detections.json has no box for scene 9 image 9", "warning")]
+
+
+def test_recorded_categories_must_be_in_the_catalogue(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match=r"entry 0: category_id 99 is none of 1, 2, 3"):
+        recorded(tmp_path, [entry(category_id=99)])
+
+
+@pytest.mark.slow
+def test_the_network_finds_objects_in_images_it_never_saw() -> None:
+    made = list(examples(Catalogue.load(CATALOGUE), layouts=30, views=2, seed=5000))
+    network = DetectionNetwork.load(ROOT / "stages/perception/detector.safetensors")
+    evaluation = evaluate(network, made)
+    assert evaluation.objects > 150
+    assert evaluation.mean_precision >= 0.85

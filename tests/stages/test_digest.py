@@ -1,0 +1,243 @@
+"""From a frame to ranked scenes and results on disk: the stages of DIGEST, without a runner between them."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.accuracy import Truth, read_truth, right_sets, score, table
+from runner.contract import Finished, Refused
+from stages.camera import DatasetCamera
+from stages.detector import RecordedDetections
+from stages.devices.bop_results import Result, read_results
+from stages.hypotheses import Hypotheses
+from stages.messages import (
+    Candidate,
+    Candidates,
+    Frame,
+    ObjectPose,
+    Observation,
+    Posterior,
+    SceneEstimate,
+    SceneGraph,
+)
+from stages.particle_filter import ParticleFilter
+from stages.perception.poses import exp_so3, pose
+from stages.ranker import Ranker
+from stages.results import BopResults
+from stages.scene.catalogue import Catalogue
+from tests.stages.episodes import Recorded
+from tests.stages.perception.scenes import CATALOGUE, CATALOGUE_FILE, DATA, VIEW, K, Rendered, render, upright
+
+PLACED = {"mug": upright("mug", -0.05, 0.0, 0.6), "tea_box": upright("tea_box", 0.1, 0.06, 0.2)}
+
+
+def frame(seen: Rendered, **fields: object) -> Frame:
+    return Frame(
+        rgb=np.zeros((VIEW.height, VIEW.width, 3), np.uint8), depth=seen.scene.depth, K=K, T_base_camera=None,
+        robot_mask=None, name="scene", index=0, total=1, scene_id=3, image_id=7, **fields,
+    )  # fmt: skip
+
+
+def candidates(*each: tuple[str, np.ndarray, float]) -> Candidates:
+    found = tuple(Candidate(box=box, label=label, confidence=confidence) for label, box, confidence in each)
+    return Candidates(candidates=found, labels=("mug", "tea_box"), confidences=np.zeros((len(found), 2)))
+
+
+def enumerate_(config: Hypotheses.Config, frame: Frame, found: Candidates) -> tuple[list, Recorded]:
+    ctx = Recorded()
+    return list(Hypotheses(config).on_candidates(frame, found, ctx)), ctx
+
+
+@pytest.fixture(scope="module")
+def seen() -> Rendered:
+    return render(PLACED)
+
+
+def both(seen: Rendered) -> Candidates:
+    return candidates(("mug", seen.boxes["mug"], 0.7), ("tea_box", seen.boxes["tea_box"], 0.9))
+
+
+def test_the_observation_comes_first_then_every_combination(seen: Rendered) -> None:
+    found = both(seen)
+    messages, _ = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), found)
+    observation, *hypotheses = messages
+    assert isinstance(observation, Observation) and (observation.scene_id, observation.image_id) == (3, 7)
+    assert [[c.label for c in h.candidates] for h in hypotheses] == [["tea_box"], ["mug"]]
+    assert [(h.index, h.count) for h in hypotheses] == [(0, 2), (1, 2)]
+    truth = seen.scene.foreground
+    assert (observation.foreground & truth).sum() > 0.85 * truth.sum()
+    assert (observation.foreground & ~truth).sum() < 0.02 * truth.sum()
+
+
+def test_the_cap_says_what_it_leaves_out(seen: Rendered) -> None:
+    box = seen.boxes["mug"]
+    found = candidates(*[("mug", box, 0.5 + 0.05 * i) for i in range(6)])
+    (_, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=3, max_hypotheses=5), frame(seen), found)
+    assert len(hypotheses) == 5 and {h.left_out for h in hypotheses} == {15}
+    assert len(ctx.lines) == 1 and "5 of 20 hypotheses, 15 of the least confident left out" in ctx.lines[0]
+
+
+@pytest.mark.parametrize(("n_objects", "count"), [(0, 0), (2, 0), (5, 2)])
+def test_one_hypothesis_where_there_is_nothing_to_choose(seen: Rendered, n_objects: int, count: int) -> None:
+    found = both(seen) if count else candidates()
+    (_, *hypotheses), _ = enumerate_(Hypotheses.Config(n_objects=n_objects), frame(seen), found)
+    assert [len(h.candidates) for h in hypotheses] == [count]
+
+
+def test_the_number_of_objects_comes_from_the_frame_or_is_asked_for(seen: Rendered) -> None:
+    (_, *hypotheses), _ = enumerate_(Hypotheses.Config(), frame(seen, n_objects=1), both(seen))
+    assert len(hypotheses) == 2
+    with pytest.raises(Refused, match=r"set hypotheses\.n_objects to a whole number"):
+        enumerate_(Hypotheses.Config(), frame(seen), both(seen))
+
+
+def test_an_image_without_depth_is_refused(seen: Rendered) -> None:
+    blind = msgspec.structs.replace(frame(seen), depth=np.zeros_like(seen.scene.depth))
+    with pytest.raises(Refused, match="scene: no support plane; the depth image has 0 readings"):
+        enumerate_(Hypotheses.Config(n_objects=1), blind, candidates())
+
+
+@pytest.mark.parametrize("field", [{"n_objects": -1}, {"max_hypotheses": 0}, {"max_height": 0.0}])
+def test_settings_are_checked(field: dict) -> None:
+    with pytest.raises(Refused, match=f"hypotheses.{next(iter(field))} is"):
+        Hypotheses.Config(**field)
+
+
+@pytest.mark.parametrize(
+    "field", [{"dof": 4}, {"form": "best"}, {"particles": 1}, {"iterations": 0}, {"lambda_r": 0.0}]
+)
+def test_filter_settings_are_checked(field: dict) -> None:
+    with pytest.raises(Refused, match=f"particle_filter.{next(iter(field))} is"):
+        ParticleFilter.Config(catalogue=str(CATALOGUE_FILE), **field)
+
+
+@pytest.fixture(scope="module")
+def filter_stage() -> ParticleFilter:
+    return ParticleFilter(ParticleFilter.Config(catalogue=str(CATALOGUE_FILE), iterations=60))
+
+
+def test_the_true_scene_outweighs_the_false_one(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    false = ("tea_box", seen.boxes["mug"], 0.99)
+    found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), false)
+    (observation, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=2), frame(seen), found)
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert sorted(item.name for item in estimate.objects) == ["mug", "tea_box"]
+    assert sorted(p.name for p in posteriors[0].objects) == ["tea_box", "tea_box_2"]
+    for item in estimate.objects:
+        assert item.T_camera_object[:3, 3] == pytest.approx(seen.poses[item.name][:3, 3], abs=0.006)
+    assert posteriors[0].traces[0].positions.shape[1] == 4
+
+
+def test_an_empty_hypothesis_has_an_empty_scene(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    (observation, hypothesis), ctx = enumerate_(Hypotheses.Config(n_objects=4), frame(seen), candidates())
+    posterior = filter_stage.on_hypothesis(hypothesis, observation, ctx)
+    assert posterior.objects == () and posterior.log_weight < 0
+
+
+def posterior(index: int, log_weight: float) -> Posterior:
+    return Posterior(index=index, count=3, objects=(), log_weight=log_weight)
+
+
+def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
+    (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
+    weights = (-3.0, -1.0, -1.0)
+    estimate = Ranker(Ranker.Config()).on_posteriors([posterior(*p) for p in enumerate(weights)], observation, ctx)
+    assert estimate.winner == 1 and estimate.log_weights.tolist() == list(weights)
+    assert (estimate.scene_id, estimate.image_id, estimate.name) == (3, 7, "scene")
+
+
+def estimate_of(poses: dict[str, np.ndarray]) -> SceneEstimate:
+    items = tuple(
+        ObjectPose(name=label, label=label, T_camera_object=T, confidence=0.5, cost=0.0, box=np.zeros(4))
+        for label, T in poses.items()
+    )
+    return SceneEstimate(
+        objects=items, winner=0, log_weights=np.zeros(1), left_out=0, T_camera_table=np.eye(4), T_base_camera=None,
+        K=K, scene_id=3, image_id=7, name="scene",
+    )  # fmt: skip
+
+
+def test_results_survive_the_round_trip(seen: Rendered, tmp_path: Path) -> None:
+    ctx = Recorded()
+    labels = ("mug", "tea_box")
+    poses = {
+        label: pose(exp_so3(np.array([0.1, i, -0.3])), np.array([0.1, -0.25, 0.8 + i]))
+        for i, label in enumerate(labels)
+    }
+    estimate = estimate_of(poses)
+    graph = SceneGraph(objects=(), virtual_objects=(), assertions=(), T_base_table=np.eye(4), T_base_camera=None, K=K)
+    path = tmp_path / "deep" / "out.csv"
+    stage = BopResults(BopResults.Config(path=str(path), catalogue=str(CATALOGUE_FILE)))
+    answer = stage.on_scene_graph(frame(seen), estimate, graph, ctx)
+    assert isinstance(answer, Finished) and answer.code == 0
+    results = read_results(path)
+    assert [(r.scene_id, r.image_id) for r in results] == [(3, 7)] * 2
+    assert [r.label for r in results] == [CATALOGUE[item.label].label for item in estimate.objects]
+    for result, T in zip(results, poses.values(), strict=True):
+        assert result.T_camera_object == pytest.approx(T, abs=1e-8)
+    with path.open() as file:
+        assert next(csv.reader(file)) == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+    assert (tmp_path / "deep" / "out" / "000003_000007.json").is_file()
+    assert "mug" in ctx.lines[-1]
+
+
+def test_a_broken_result_file_names_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "out.csv"
+    path.write_text("scene_id,im_id,obj_id,score,R,t,time\n1,0,2,0.5,1 0 0,0 0 1,0\n")
+    with pytest.raises(Refused, match=r"out.csv:2: not a line of"):
+        read_results(path)
+    with pytest.raises(Refused, match=r"must end in \.csv"):
+        BopResults.Config(path="out.txt", catalogue="")
+
+
+def test_scores_match_each_result_once_and_count_what_is_missing() -> None:
+    near, far = pose(np.eye(3), np.array([0.0, 0.0, 1.0])), pose(np.eye(3), np.array([0.3, 0.0, 1.0]))
+    label = CATALOGUE["tea_box"].label
+    truths = [Truth((1, 0), label, near), Truth((1, 0), label, far), Truth((2, 0), label, near)]
+    close = far @ pose(exp_so3(np.array([0.0, 0.0, np.deg2rad(12)])), np.array([0.004, 0.0, 0.0]))
+    results = [Result(1, 0, label, 0.9, T, -1.0) for T in (close, near)]
+    first, second, missing = score(truths, results, CATALOGUE)
+    assert first.within(0.001, 1)
+    assert second.within(0.02, 15) and not second.within(0.01, 10)
+    assert second.metres == pytest.approx(0.004, abs=1e-6) and np.rad2deg(second.radians) == pytest.approx(12)
+    assert not missing.within(10, 180)
+    assert right_sets(truths, results) == (1, 2)
+    assert "66.7 %  (2 of 3)" in table([first, second, missing], (1, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "dof", "images"), [("household-layout", 3, 3), ("ycb-real", 6, 2)])
+def test_data_sets_with_exact_boxes(name: str, dof: Literal[3, 6], images: int) -> None:
+    dataset = DATA / name
+    if not dataset.exists():
+        pytest.skip("the data sets are not beside the repository (../shared/data)")
+    models = dataset / "models"
+    detector = RecordedDetections(
+        RecordedDetections.Config(detections=dataset / "detections_exact.json", catalogue=models)
+    )
+    particle_filter = ParticleFilter(ParticleFilter.Config(catalogue=str(models), dof=dof))
+    ctx = Recorded()
+    results: list[Result] = []
+    for image in DatasetCamera(DatasetCamera.Config(dataset=dataset, limit=images)).source(ctx):
+        observation, hypothesis = Hypotheses(Hypotheses.Config()).on_candidates(
+            image, detector.on_frame(image, ctx), ctx
+        )
+        estimate = Ranker(Ranker.Config()).on_posteriors(
+            [particle_filter.on_hypothesis(hypothesis, observation, ctx)], observation, ctx
+        )
+        catalogue = Catalogue.load(models)
+        results += [Result.of(estimate, item, catalogue[item.label].label, -1.0) for item in estimate.objects]
+    seen = {(result.scene_id, result.image_id) for result in results}
+    truths = [truth for truth in read_truth(dataset) if truth.image in seen]
+    scores = score(truths, results, Catalogue.load(models))
+    assert len(seen) == images
+    assert np.mean([one.adds < 0.02 for one in scores]) >= 0.9
+    if dof == 3:
+        assert np.mean([one.within(0.02, 15) for one in scores]) >= 0.9

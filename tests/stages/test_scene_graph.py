@@ -1,0 +1,45 @@
+"""The scene graph stage: frames, and what it refuses."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from runner.contract import Refused
+from stages.scene_graph import SceneGraphBuilder
+from tests.stages.layouts import CATALOGUE, T_BASE_TABLE, asserted, breakfast, builder
+
+
+def test_poses_are_in_the_base_frame():
+    layout = breakfast()
+    graph = layout.graph()
+    assert graph.T_base_table == pytest.approx(T_BASE_TABLE)
+    for item in graph.objects:
+        assert item.T_base_object == pytest.approx(T_BASE_TABLE @ layout.poses[item.name], abs=1e-9)
+
+
+def test_without_a_robot_the_table_frame_is_the_base():
+    layout = breakfast()
+    estimate = msgspec.structs.replace(layout.estimate(), T_base_camera=None)
+    graph = builder().on_scene_estimate(estimate)
+    assert graph.T_base_camera is None
+    assert graph.T_base_table == pytest.approx(np.eye(4))
+    assert graph.objects[0].T_base_object == pytest.approx(layout.poses["tray"], abs=1e-9)
+    assert asserted(graph) == asserted(layout.graph())
+
+
+def test_an_empty_scene_has_an_empty_graph():
+    estimate = msgspec.structs.replace(breakfast().estimate(), objects=())
+    assert builder().on_scene_estimate(estimate).assertions == ()
+
+
+def test_objects_that_the_catalogue_does_not_hold_are_refused():
+    estimate = breakfast().estimate()
+    unknown = msgspec.structs.replace(estimate.objects[0], label="teapot")
+    with pytest.raises(Refused, match=r"'teapot' is not in .*catalogue.yaml; known: bowl, "):
+        builder().on_scene_estimate(msgspec.structs.replace(estimate, objects=(unknown,)))
+
+
+@pytest.mark.parametrize("field", ["gap", "radius"])
+def test_distances_must_be_positive(field: str):
+    with pytest.raises(Refused, match=f"scene_graph.{field}=0: must be a positive number of metres"):
+        SceneGraphBuilder.Config(catalogue=str(CATALOGUE), **{field: 0})
