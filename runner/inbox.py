@@ -37,6 +37,7 @@ class Inbox:
     def __init__(self, node: Node):
         self._node = node
         self._lineages = {handler.name: OrderedDict[str, _Lineage]() for handler in node.type.handlers}
+        self._turns = {handler.name: deque[str]() for handler in node.type.handlers}
         self._ready: deque[Ready] = deque()
         self.skipped = 0
         """Messages that a newer one replaced, on edges of policy ``latest``."""
@@ -46,15 +47,14 @@ class Inbox:
         handler = self._node.type.handler_of(arrival.port.name)
         if self._node.inputs[arrival.port.name].policy == "latest":
             self._discard_older(handler, arrival.port)
-        lineages = self._lineages[handler.name]
-        lineage = lineages.setdefault(arrival.envelope.lineage, _Lineage())
+        lineage = self._lineages[handler.name].setdefault(arrival.envelope.lineage, _Lineage())
         waiting = lineage.waiting.setdefault(arrival.port.name, deque())
         if arrival.port.kind == "gather":
             _check_siblings(arrival, waiting)
         waiting.append(arrival)
-        self._ready.extend(self._complete(handler, lineage))
-        if not any(lineage.waiting.values()):
-            del lineages[arrival.envelope.lineage]
+        if arrival.port == _turn_port(handler):
+            self._turns[handler.name].append(arrival.envelope.lineage)
+        self._ready.extend(self._complete(handler, arrival.envelope.lineage))
         self._forget_oldest(handler)
 
     @property
@@ -74,14 +74,28 @@ class Inbox:
                 if any(lineage.waiting.get(port.name) for port in handler.inputs if not handler.keeps(port)):
                     yield handler, root, lacking
 
-    def _complete(self, handler: Handler, lineage: _Lineage) -> Iterator[Ready]:
+    def _complete(self, handler: Handler, newest: str) -> Iterator[Ready]:
+        """Steps that can run now: those of the newest lineage, or where gathers take turns, of all whose turn it is."""
+        if _turn_port(handler) is None:
+            yield from self._steps(handler, newest)
+        turns = self._turns[handler.name]
+        while turns and (steps := list(self._steps(handler, turns[0]))):
+            yield from steps
+            turns.popleft()
+
+    def _steps(self, handler: Handler, root: str) -> Iterator[Ready]:
+        lineage = self._lineages[handler.name].get(root, _Lineage())
         while all(_satisfied(port, lineage) for port in handler.inputs):
             arrivals = [arrival for port in handler.inputs for arrival in _take(handler, port, lineage)]
             yield Ready(handler, tuple(arrivals))
+        if not any(lineage.waiting.values()):
+            self._lineages[handler.name].pop(root, None)
 
     def _discard_older(self, handler: Handler, port: InputPort) -> None:
         for lineage in self._lineages[handler.name].values():
             self.skipped += len(lineage.waiting.pop(port.name, ()))
+        if port == _turn_port(handler):
+            self._turns[handler.name].clear()
         if len(handler.inputs) == 1:
             kept = [ready for ready in self._ready if ready.handler is not handler]
             self.skipped += len(self._ready) - len(kept)
@@ -96,6 +110,13 @@ class Inbox:
             if finished is None:
                 return
             del lineages[finished]
+
+
+def _turn_port(handler: Handler) -> InputPort | None:
+    """The port beside a gather whose order of arrival its steps keep: replicas finish lineages in any order."""
+    if all(port.kind == "one" for port in handler.inputs):
+        return None
+    return next((port for port in handler.inputs if port.kind == "one"), None)
 
 
 def _only_stays(handler: Handler, lineage: _Lineage) -> bool:

@@ -65,6 +65,18 @@ def test_lineages_do_not_mix():
     assert [lacking for _, _, lacking in inbox.incomplete()] == [["answers"]] * 3
 
 
+def test_gathers_keep_the_order_in_which_their_lineages_began():
+    gatherer = node("gatherer")
+    inbox = Inbox(gatherer)
+    for lineage in range(3):
+        inbox.add(number(gatherer, lineage))
+    for lineage in (2, 1):
+        inbox.add(answer(gatherer, 0, lineage=lineage, count=1))
+        assert not inbox.has_ready
+    inbox.add(answer(gatherer, 0, lineage=0, count=1))
+    assert [step[-1] for step in steps(inbox)] == [f"counter.number#{lineage}" for lineage in range(3)]
+
+
 @pytest.mark.parametrize("number_at", range(3))
 def test_every_part_is_joined_with_what_its_lineage_shares(number_at: int):
     worker = node("worker")
