@@ -8,7 +8,7 @@ costs there less what the background had cost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +49,13 @@ class CostForm:
         return CostForm(truncation=100.0, occluder_margin=100.0, occluder_cost=0.0, contact_slack=100.0, plain=True)
 
     def truncated(self, truncation: float) -> CostForm:
-        """The same form with a tighter bound."""
-        return CostForm(
+        """The same form with a tighter bound; what is measured against the bound shrinks with it."""
+        share = truncation / self.truncation
+        return replace(
+            self,
             truncation=truncation,
-            occluder_margin=truncation,
-            occluder_cost=self.occluder_cost * truncation / self.truncation,
-            contact_slack=self.contact_slack,
+            occluder_margin=self.occluder_margin * share,
+            occluder_cost=self.occluder_cost * share,
         )
 
 

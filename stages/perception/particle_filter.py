@@ -8,10 +8,12 @@ number of threads, so that equal seeds give equal bytes in any process.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.contract import Refused
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window, credits
 from stages.perception.proposals import Dof, Guess, Proposals, distinct_best
 from stages.perception.rasteriser import Float32s
@@ -61,15 +63,53 @@ class FilterSettings:
     """Times that objects are visited again once all are known, where something has changed since or they fit badly."""
     poor: float = 0.005
     """Mean distance from which a fit is bad, metres."""
+    joint: bool = True
+    """All objects of the winning scene are polished together."""
+    contact: bool = True
+    """Objects that reach into one another, or that nothing supports, cost something."""
+    colour: bool = True
+    """Colour decides between poses that depth cannot tell apart."""
+
+    def without(self, *improvements: str) -> FilterSettings:
+        """These settings with improvements over the paper's plain form switched off, each by its name.
+
+        Raises:
+            Refused: there is no improvement of that name; names those that there are.
+        """
+        settings = self
+        for name in improvements:
+            if name not in IMPROVEMENTS:
+                raise Refused(f"'{name}' is no improvement that can be switched off; choose {', '.join(IMPROVEMENTS)}")
+            changes = dict(IMPROVEMENTS[name])
+            form = replace(settings.cost, **changes.pop("cost", {}))
+            settings = replace(settings, cost=form, **changes)
+        return settings
 
     @staticmethod
     def paper(*, particles: int = 625, iterations: int = 400, dof: Dof = 6) -> FilterSettings:
-        """The paper's plain form: fixed diffusion, fixed scale, unbounded distance, nothing else."""
-        return FilterSettings(
-            particles=particles, iterations=iterations, dof=dof, cost=CostForm.paper(), lambda_r=1.0, overdraw=0,
-            metres=(0.01, 0.01), radians=(np.deg2rad(10.0), np.deg2rad(10.0)), flips=0.0, renewed=0.0, polished=0.0,
-            elitism=False, coarse_pixels=None, fine_truncation=None, schedule=None, sweeps=0,
-        )  # fmt: skip
+        """The paper's plain form: every improvement is switched off."""
+        return FilterSettings(particles=particles, iterations=iterations, dof=dof).without(*IMPROVEMENTS)
+
+
+_TURN = np.deg2rad(10.0)
+IMPROVEMENTS: dict[str, dict[str, Any]] = {
+    "bounded likelihood": {"cost": {"truncation": 100.0, "plain": True}, "fine_truncation": None},
+    "occlusion": {"cost": {"occluder_margin": 100.0, "occluder_cost": 0.0}},
+    "annealing": {"metres": (0.01, 0.01), "radians": (_TURN, _TURN)},
+    "adaptive scale": {"lambda_r": 1.0},
+    "flips": {"flips": 0.0},
+    "coarse to fine": {"coarse_pixels": None},
+    "truncation": {"fine_truncation": None},
+    "re-initialisation": {"renewed": 0.0},
+    "elitism": {"elitism": False},
+    "joint refinement": {"sweeps": 0, "joint": False},
+    "polish": {"polished": 0.0},
+    "contact": {"cost": {"contact_slack": 100.0}, "contact": False},
+    "overdraw": {"overdraw": 0},
+    "early stop": {"schedule": None},
+    "colour": {"colour": False},
+}
+"""What each improvement over the paper's plain form sets when it is switched off; ``cost`` are fields of CostForm."""
 
 
 @dataclass(frozen=True)

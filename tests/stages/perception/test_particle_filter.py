@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from runner.contract import Refused
+from stages.perception.likelihood import CostForm
 from stages.perception.metrics import pose_errors
-from stages.perception.particle_filter import FilterSettings
+from stages.perception.particle_filter import IMPROVEMENTS, FilterSettings
 from stages.perception.poses import exp_so3, pose
 from stages.perception.scene_filter import SceneFilter, Suspect
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
@@ -53,6 +55,27 @@ def test_the_papers_plain_form_converges_upright() -> None:
     result = SceneFilter(CATALOGUE, settings).estimate(seen.scene, suspects(seen, "tea_box"))
     metres, _ = errors(seen, "tea_box", result.objects[0].track.T_camera_object)
     assert metres < 0.02
+
+
+def test_the_papers_plain_form_has_no_improvement() -> None:
+    paper = FilterSettings.paper()
+    assert paper.cost == CostForm.paper()
+    assert (paper.particles, paper.iterations, paper.lambda_r, paper.overdraw, paper.sweeps) == (625, 400, 1.0, 0, 0)
+    assert not (paper.elitism or paper.flips or paper.renewed or paper.polished or paper.joint or paper.colour)
+    assert paper.metres[0] == paper.metres[1] and paper.radians[0] == paper.radians[1]
+
+
+@pytest.mark.parametrize("name", IMPROVEMENTS)
+def test_every_improvement_can_be_switched_off_alone(name: str) -> None:
+    without = FilterSettings().without(name)
+    assert without != FilterSettings()
+    others = [other for other in IMPROVEMENTS if other != name]
+    assert FilterSettings().without(*others).without(name) == FilterSettings.paper()
+
+
+def test_an_unknown_improvement_is_refused() -> None:
+    with pytest.raises(Refused, match=r"'anealing'.*annealing"):
+        FilterSettings().without("anealing")
 
 
 def test_the_wrong_object_costs_more() -> None:
