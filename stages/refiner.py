@@ -1,0 +1,61 @@
+"""The ranked scene in, the same scene refined out: joint polish at full resolution, flips settled by colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from runner.contract import Context, Refused, Stage
+from stages.messages import ObjectPose, Observation, SceneEstimate
+from stages.perception.likelihood import ObservedScene
+from stages.perception.poses import pose
+from stages.perception.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
+from stages.scene.catalogue import Catalogue
+
+
+class Refiner(Stage):
+    """Does once, for the winner, what would be too dear for every hypothesis."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """Settings; ``catalogue``, ``form`` and ``dof`` are those of the particle filter."""
+
+        catalogue: str
+        """A catalogue's YAML file, or a BOP ``models`` folder."""
+        form: Literal["default", "paper"] = "default"
+        """``paper`` passes the ranked scene on as it is."""
+        dof: Literal[3, 6] = 6
+
+        def __post_init__(self) -> None:
+            if self.form not in ("default", "paper"):
+                raise Refused(f"refiner.form is '{self.form}'; choose default or paper")
+            if self.dof not in (3, 6):
+                raise Refused(f"refiner.dof is {self.dof}; choose 3 or 6")
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self._refiner: SceneRefiner | None = None
+        if config.form == "default":
+            settings = RefinementSettings(dof=config.dof)
+            self._refiner = SceneRefiner(Catalogue.load(Path(config.catalogue)), settings)
+            self._refiner.warm_up()
+
+    def on_scene_estimate(self, scene_estimate: SceneEstimate, observation: Observation, ctx: Context) -> SceneEstimate:
+        """The same objects at better poses."""
+        if self._refiner is None:
+            return scene_estimate
+        scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+        placed = [Placed(item.label, item.T_camera_object) for item in scene_estimate.objects]
+        refined = self._refiner.refine(scene, observation.rgb, placed)
+        objects = tuple(map(_object, scene_estimate.objects, refined.objects))
+        return msgspec.structs.replace(scene_estimate, objects=objects)
+
+
+def _object(item: ObjectPose, refined: RefinedObject) -> ObjectPose:
+    T = refined.T_camera_object
+    return msgspec.structs.replace(
+        item, T_camera_object=pose(T[:, :3], T[:, 3]), cost=refined.cost, visible=refined.visible
+    )

@@ -1,0 +1,71 @@
+"""The refiner as a stage: the ranked scene in, the same scene out, closer to the truth."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from runner.contract import Refused
+from stages.messages import ObjectPose, Observation, SceneEstimate
+from stages.perception.poses import exp_so3, pose
+from stages.refiner import Refiner
+from tests.stages.episodes import Recorded
+from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright
+
+PLACED = {"mug": upright("mug", -0.05, 0.0, 0.6), "tea_box": upright("tea_box", 0.1, 0.06, 0.2)}
+OFF = pose(exp_so3(np.array([0.03, -0.02, 0.03])), np.array([0.003, -0.002, 0.004]))
+
+
+@pytest.fixture(scope="module")
+def seen() -> Rendered:
+    return render(PLACED)
+
+
+def observation(seen: Rendered) -> Observation:
+    return Observation(
+        depth=seen.scene.depth, rgb=np.zeros((VIEW.height, VIEW.width, 3), np.uint8),
+        foreground=seen.scene.foreground, K=K, T_camera_table=camera(), T_base_camera=None,
+        scene_id=3, image_id=7, name="scene",
+    )  # fmt: skip
+
+
+def estimate(seen: Rendered) -> SceneEstimate:
+    items = tuple(
+        ObjectPose(name=label, label=label, T_camera_object=T @ OFF, confidence=0.5, cost=1.0, box=seen.boxes[label])
+        for label, T in seen.poses.items()
+    )
+    return SceneEstimate(
+        objects=items, winner=1, log_weights=np.array([-2.0, -1.0]), left_out=4, T_camera_table=camera(),
+        T_base_camera=None, K=K, scene_id=3, image_id=7, name="scene",
+    )  # fmt: skip
+
+
+def test_poses_come_closer_and_all_else_stays(seen: Rendered) -> None:
+    before = estimate(seen)
+    after = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE))).on_scene_estimate(
+        before, observation(seen), Recorded()
+    )
+    assert [item.name for item in after.objects] == [item.name for item in before.objects]
+    for item in after.objects:
+        assert item.T_camera_object[:3, 3] == pytest.approx(seen.poses[item.name][:3, 3], abs=0.0015)
+        assert item.cost < 0.002 and 0.5 < item.visible <= 1.0
+    assert msgspec.structs.replace(after, objects=before.objects) == before
+
+
+def test_the_plain_form_passes_the_scene_on(seen: Rendered) -> None:
+    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), form="paper"))
+    before = estimate(seen)
+    assert stage.on_scene_estimate(before, observation(seen), Recorded()) is before
+
+
+def test_a_scene_without_objects_stays_one(seen: Rendered) -> None:
+    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+    empty = msgspec.structs.replace(estimate(seen), objects=())
+    assert stage.on_scene_estimate(empty, observation(seen), Recorded()).objects == ()
+
+
+@pytest.mark.parametrize("field", [{"dof": 4}, {"form": "best"}])
+def test_settings_are_checked(field: dict) -> None:
+    with pytest.raises(Refused, match=f"refiner.{next(iter(field))} is"):
+        Refiner.Config(catalogue=str(CATALOGUE_FILE), **field)
