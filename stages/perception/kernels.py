@@ -9,7 +9,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from stages.perception.rasteriser import INLINED, KERNEL, fill, screen_bounds, screen_matrix, set_up
+from stages.perception.pixel_math import INLINED, KERNEL, height_row, pixel_cost, screen_matrix
+from stages.perception.rasteriser import fill, screen_bounds, set_up
 
 IMPOSSIBLE = 1e6
 """Cost of a pose that reaches into the camera, in metres times pixels."""
@@ -52,20 +53,14 @@ def _scan(Z, x0, y0, columns, rows, width, background, observed, factor, credit,
             q = Z[z + x]
             Z[z + x] = _f(0)
             i = o + x
-            behind = factor[i] * (_f(1) / q - observed[i])
-            cost = min(abs(behind), truncation) - credit[i]
-            cost = occluder if behind > margin else cost
-            total += cost if (q > background[i] and factor[i] > _f(0)) else _f(0)
+            total += pixel_cost(q, background[i], observed[i], factor[i], credit[i], truncation, margin, occluder)
     return total
 
 
 @numba.njit(**INLINED)
 def _depth_below(support, pose, plane):
     """How far the lowest point lies below the plane, metres (negative above)."""
-    a = plane[0] * pose[0, 0] + plane[1] * pose[1, 0] + plane[2] * pose[2, 0]
-    b = plane[0] * pose[0, 1] + plane[1] * pose[1, 1] + plane[2] * pose[2, 1]
-    c = plane[0] * pose[0, 2] + plane[1] * pose[1, 2] + plane[2] * pose[2, 2]
-    d = plane[0] * pose[0, 3] + plane[1] * pose[1, 3] + plane[2] * pose[2, 3] + plane[3]
+    a, b, c, d = height_row(pose, plane)
     lowest = _f(1e9)
     for i in range(support.shape[0]):
         lowest = min(lowest, a * support[i, 0] + b * support[i, 1] + c * support[i, 2] + d)

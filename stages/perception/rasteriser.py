@@ -6,39 +6,25 @@ that the depth test is a maximum and an empty pixel is zero. Back faces are cull
 integer coordinates and edges are inclusive.
 """
 
-# ruff: noqa: PLR0915, PLR0917, PLW3301
+# ruff: noqa: PLR0917, PLW3301
 # pyright: reportMissingParameterType=false
 # Kernels take plain arrays by position, and only nested minima of two values compile to vector instructions.
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.perception.pixel_math import INLINED, KERNEL, NEAR, screen_matrix, triangle_setup
 from stages.scene.catalogue import Floats, Mesh
 
 Float32s = NDArray[np.float32]
 
 LANES = 16
 SETUP_ROWS = 13
-NEAR = 0.05
-"""Metres: nothing with a corner closer than this is rendered."""
-
-# Reassociation lets sums vectorise; NaN and infinity keep their meaning. No parallel reduction anywhere:
-# the bytes must not depend on how many threads a machine has.
-KERNEL: dict[str, Any] = {
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-    "cache": True,
-    "boundscheck": False,
-    "error_model": "numpy",
-}
-# A function that kernels call must vanish into them: otherwise two copies of it exist, compiled in different
-# surroundings, and which one runs depends on whether this process compiled the kernel or loaded it from the cache.
-INLINED: dict[str, Any] = KERNEL | {"forceinline": True}
 _f = np.float32
 _u = np.uintp
 
@@ -140,19 +126,6 @@ def render_inverse(lanes, blocks, corners, pose, view, z_buffer, scratch):
 
 
 @numba.njit(**INLINED)
-def screen_matrix(pose, view):
-    """Rows of K [R | t]: homogeneous pixel coordinates of object points."""
-    fx, fy, cx, cy = view[0], view[1], view[2], view[3]
-    return (
-        pose[0, 0] * fx + pose[2, 0] * cx, pose[0, 1] * fx + pose[2, 1] * cx,
-        pose[0, 2] * fx + pose[2, 2] * cx, pose[0, 3] * fx + pose[2, 3] * cx,
-        pose[1, 0] * fy + pose[2, 0] * cy, pose[1, 1] * fy + pose[2, 1] * cy,
-        pose[1, 2] * fy + pose[2, 2] * cy, pose[1, 3] * fy + pose[2, 3] * cy,
-        pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3],
-    )  # fmt: skip
-
-
-@numba.njit(**INLINED)
 def screen_bounds(corners, m, view):
     """Pixels x0, y0, x1, y1 (inclusive) the enclosing box may touch; x1 < x0 where none, x0 beyond the view where
     a corner is too near."""
@@ -174,55 +147,19 @@ def screen_bounds(corners, m, view):
 
 @numba.njit(**INLINED)
 def set_up(S, blocks, m, left, right, top, bottom, T):
-    """Projects every triangle and stores, lane by lane: width, height, first pixel (relative to left, top), the two
-    edge functions and inverse depth at that pixel, and their steps in x and y. Width 0 culls."""
-    m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10, m11 = m
-    one = _f(1)
-    zero = _f(0)
+    """Stores what ``triangle_setup`` says of every triangle, lane by lane."""
     for b in range(_u(blocks)):
         s = b * _u(9 * LANES)
         o = b * _u(SETUP_ROWS * LANES)
         for lane in range(_u(LANES)):
             i = s + lane
             k = o + lane
-            x, y, z = S[i], S[i + _u(16)], S[i + _u(32)]
-            za = one / (m8 * x + m9 * y + m10 * z + m11)
-            ua = (m0 * x + m1 * y + m2 * z + m3) * za
-            va = (m4 * x + m5 * y + m6 * z + m7) * za
-            x, y, z = S[i + _u(48)], S[i + _u(64)], S[i + _u(80)]
-            w = one / (m8 * x + m9 * y + m10 * z + m11)
-            ub = (m0 * x + m1 * y + m2 * z + m3) * w - ua
-            vb = (m4 * x + m5 * y + m6 * z + m7) * w - va
-            z1 = w - za
-            x, y, z = S[i + _u(96)], S[i + _u(112)], S[i + _u(128)]
-            w = one / (m8 * x + m9 * y + m10 * z + m11)
-            ud = (m0 * x + m1 * y + m2 * z + m3) * w - ua
-            vd = (m4 * x + m5 * y + m6 * z + m7) * w - va
-            z2 = w - za
-            area = ub * vd - vb * ud
-            x0 = max(left, np.ceil(ua + min(zero, min(ub, ud))))
-            x1 = min(right, np.floor(ua + max(zero, max(ub, ud))))
-            y0 = max(top, np.ceil(va + min(zero, min(vb, vd))))
-            y1 = min(bottom, np.floor(va + max(zero, max(vb, vd))))
-            inverse_area = one / area
-            bx, by = vd * inverse_area, -ud * inverse_area
-            dx, dy = -vb * inverse_area, ub * inverse_area
-            zx, zy = bx * z1 + dx * z2, by * z1 + dy * z2
-            px, py = x0 - ua, y0 - va
-            # Seen from outside, a counter-clockwise face turns clockwise on a screen whose y points down.
-            T[k] = x1 - x0 + one if area < zero else zero
-            T[k + _u(16)] = y1 - y0 + one
-            T[k + _u(32)] = x0 - left
-            T[k + _u(48)] = y0 - top
-            T[k + _u(64)] = bx * px + by * py
-            T[k + _u(80)] = dx * px + dy * py
-            T[k + _u(96)] = za + zx * px + zy * py
-            T[k + _u(112)] = bx
-            T[k + _u(128)] = by
-            T[k + _u(144)] = dx
-            T[k + _u(160)] = dy
-            T[k + _u(176)] = zx
-            T[k + _u(192)] = zy
+            (T[k], T[k + _u(16)], T[k + _u(32)], T[k + _u(48)], T[k + _u(64)], T[k + _u(80)], T[k + _u(96)],
+             T[k + _u(112)], T[k + _u(128)], T[k + _u(144)], T[k + _u(160)], T[k + _u(176)],
+             T[k + _u(192)]) = triangle_setup(
+                S[i], S[i + _u(16)], S[i + _u(32)], S[i + _u(48)], S[i + _u(64)], S[i + _u(80)], S[i + _u(96)],
+                S[i + _u(112)], S[i + _u(128)], m, left, right, top, bottom,
+            )  # fmt: skip
 
 
 @numba.njit(**INLINED)
