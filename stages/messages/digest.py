@@ -2,7 +2,7 @@
 
 from runner.contract import Message, Part, Struct
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Matrix, Pose, Rgb, Vector
-from stages.messages.scene import ObjectPose
+from stages.messages.scene import ObjectPose, UnknownRegion
 
 
 class Candidate(Struct, frozen=True, kw_only=True):
@@ -79,3 +79,7 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     scene_id: int = 0
     image_id: int = 0
     name: str = ""
+    probabilities: Vector | None = None
+    """Of each hypothesis, summing to 1: ``log_weights`` after calibration; None where they were not judged."""
+    unknown: tuple[UnknownRegion, ...] = ()
+    """What no object explains, the largest first."""

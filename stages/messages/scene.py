@@ -3,9 +3,17 @@
 from typing import Literal
 
 from runner.contract import Message, Struct
-from stages.messages.arrays import Box, Intrinsics, Pose
+from stages.messages.arrays import Box, Intrinsics, Pose, Vector
 
 Predicate = Literal["exist", "clear", "on", "in", "has"]
+
+
+class Alternative(Struct, frozen=True, kw_only=True):
+    """Another pose of an object that explains the image about as well."""
+
+    T_camera_object: Pose
+    probability: float
+    """Of this pose; what the estimate and all its alternatives leave to 1 is for poses that are not listed."""
 
 
 class ObjectPose(Struct, frozen=True, kw_only=True):
@@ -23,6 +31,31 @@ class ObjectPose(Struct, frozen=True, kw_only=True):
     box: Box
     visible: float = 1.0
     """Share of the object's silhouette that nothing else hides, 0 to 1."""
+    probability: float | None = None
+    """That the pose is right within 2 cm and 15 degrees, modulo symmetries; None where it was not judged."""
+    spread_metres: float = 0.0
+    """Standard deviation of the position, all directions together; alternatives far away apart."""
+    spread_radians: float = 0.0
+    """Standard deviation of the orientation, all axes together, modulo the object's symmetries; alternatives far away
+    apart."""
+    alternatives: tuple[Alternative, ...] = ()
+    """The most probable first."""
+    looked_through: float = 0.0
+    """Share of the visible silhouette where the reading lies clearly behind the surface, 0 to 1."""
+    contradicted: bool = False
+    """True where the image shows that the object cannot be there as estimated."""
+
+
+class UnknownRegion(Struct, frozen=True, kw_only=True):
+    """Readings above the support plane that no object of the scene explains."""
+
+    box: Box
+    points: int
+    """Readings in it."""
+    centre_table: Vector
+    """Centre of the enclosing box of its readings in the table's frame, x, y, z in metres."""
+    extent_table: Vector
+    """Edges of that box along the table's axes, metres."""
 
 
 class VirtualObject(Struct, frozen=True, kw_only=True):

@@ -1,0 +1,392 @@
+"""How sure an estimated scene is: probabilities of hypotheses and poses, spread, alternatives (docs/doubt.md).
+
+Raw weights exp(-lambda d) are far too sharp: neighbouring readings err together, and the sensor's and the model's
+biases are in no likelihood. Costs become log-odds ("nats") through scales, and evidence becomes a probability through
+a logistic model, that ``python -m benchmarks.calibration`` fits on rendered scenes of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from runner.contract import Refused
+from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.poses import compose, exp_so3, rotate, symmetry_angle
+from stages.perception.proposals import Dof, Proposals, distinct_best
+from stages.perception.rasteriser import Float32s, inverse_depth
+from stages.perception.unexplained import Region, is_contradicted, looked_through, unknown_regions
+from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+
+RIGHT_METRES = 0.02
+RIGHT_RADIANS = np.deg2rad(15.0)
+"""A pose within these of the truth, modulo the object's symmetries, is right."""
+FEATURES = ("margin", "fit", "shown", "gain", "looked through", "spread", "hypothesis", "confidence")
+"""What a probability is made of; :func:`Evidence.features`."""
+CONSTANTS = Path(__file__).with_name("calibration.yaml")
+_DETAIL = 60.0
+"""Apparent diameter at which poses are compared, pixels."""
+_FORM = CostForm().truncated(0.015)
+_PIXEL = 0.003
+"""Metres by which a reading that speaks against a pose is off, for the unit of evidence."""
+_TURNS = np.deg2rad(np.arange(10.0, 360.0, 10.0))
+_SHIFTS = np.array([-0.05, -0.03, -0.015, 0.015, 0.03, 0.05])
+_REFINED = 40
+_SCALES = ((np.deg2rad(10.0), 0.010), (np.deg2rad(3.5), 0.0035), (np.deg2rad(1.2), 0.0012))
+"""Radians and metres by which the nearest poses are spread: from what an image can leave open to what it resolves."""
+_NEARBY = 96
+"""Poses at each of these scales."""
+_ABOUT = (np.deg2rad(60.0), 0.06)
+"""Radians and metres within which a pose counts as the same one, spread out, rather than as another."""
+_KEPT = 4
+_LIKELY = 0.1
+"""Alternatives kept at most, and the least weight that one has relative to the estimate."""
+_CAP = 12.0
+"""Nats beyond which evidence is as good as any."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Constants that turn costs and evidence into probabilities."""
+
+    hypothesis_scale: float
+    """Truncated pixels per object by which scenes must differ for one nat."""
+    pose_scale: float
+    """Readings that count as one independent reading when poses of an object are compared."""
+    spread_scale: float
+    """Factor from the spread of the tempered likelihood to that of the errors."""
+    bias: float
+    weights: tuple[float, ...]
+    """One per feature."""
+    centres: tuple[float, ...]
+    scales: tuple[float, ...]
+    """Mean and deviation by which each feature is standardised."""
+
+    @staticmethod
+    @cache
+    def load(path: Path = CONSTANTS) -> Calibration:
+        """Reads the constants that the benchmark wrote.
+
+        Raises:
+            Refused: the file is not of that form; names file and key.
+        """
+        try:
+            return msgspec.convert(yaml.safe_load(path.read_text()), Calibration)
+        except (OSError, yaml.YAMLError, msgspec.ValidationError) as error:
+            raise Refused(f"{path}: {error}; `python -m benchmarks.calibration` writes this file") from None
+
+    def probability(self, features: Floats) -> float:
+        """That a pose with these features is right."""
+        standard = (features - np.array(self.centres)) / np.array(self.scales)
+        return float(1.0 / (1.0 + np.exp(-(self.bias + (standard * np.array(self.weights)).sum()))))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An object of the winning scene whose pose is to be judged."""
+
+    label: str
+    T_camera_object: Floats
+    """3 x 4 or 4 x 4."""
+    confidence: float
+    """The detector's."""
+    rivals: Floats | None = None
+    """R x 3 x 4: other poses that the estimator considered."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the image says of one object's pose."""
+
+    margin: float
+    """Nats by which the best pose that is not nearly the same is worse."""
+    fit: float
+    """Mean distance over the pixels that show it, metres, bounded."""
+    shown: float
+    """Readings that show it, at the common detail."""
+    visible: float
+    """Share of the silhouette that nothing hides."""
+    gain: float
+    """Mean cost per shown reading that the object saves, as a share of the bound; below 0 where it costs."""
+    looked_through: float
+    spread_metres: float
+    spread_radians: float
+    hypothesis: float
+    """Probability of the scene's hypothesis."""
+    confidence: float
+    alternatives: Floats
+    """A x 3 x 4, likeliest first."""
+    relative: Floats
+    """Weight of each alternative relative to the estimate's own."""
+
+    def features(self) -> Floats:
+        """The numbers that :data:`FEATURES` names."""
+        spread = max(self.spread_metres / RIGHT_METRES, self.spread_radians / RIGHT_RADIANS)
+        odds = np.clip(self.hypothesis, 1e-4, 1 - 1e-4)
+        return np.array([
+            np.clip(self.margin, -_CAP, _CAP),
+            np.log(max(self.fit, 5e-4)),
+            np.log(max(self.shown, 10.0)),
+            np.clip(self.gain, -1.0, 1.0),
+            self.looked_through,
+            np.log(np.clip(spread, 1e-2, 10.0)),
+            np.log(odds / (1 - odds)),
+            self.confidence,
+        ])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PoseDoubt:
+    """How sure the pose of one object is."""
+
+    evidence: Evidence
+    probability: float
+    """That the pose is right within 2 cm and 15 degrees, modulo symmetries."""
+    alternatives: tuple[float, ...]
+    """Probability of each of the evidence's alternatives."""
+    contradicted: bool
+
+
+@dataclass(frozen=True)
+class SceneDoubt:
+    """How sure a scene is."""
+
+    probabilities: Floats
+    """Of the hypotheses."""
+    objects: tuple[PoseDoubt, ...]
+    unknown: tuple[Region, ...]
+
+
+def hypothesis_probabilities(log_weights: Floats, scene: ObservedScene, objects: int, scale: float) -> Floats:
+    """Probability of each hypothesis, summing to 1.
+
+    ``log_weights`` are minus the costs of equation 9, metres times pixels. They are counted in pixels at the bound,
+    as a share of the foreground that one of ``objects`` has on average, so that neither the size of the image nor
+    that of the objects matters; ``scale`` of those are one nat.
+    """
+    share = max(1.0, float(scene.foreground.sum()) / max(1, objects))
+    nats = (log_weights - log_weights.max()) / (CostForm().truncation * share * scale)
+    weights = np.exp(nats)
+    return weights / weights.sum()
+
+
+class Judge:
+    """Judges scenes of one catalogue's objects."""
+
+    def __init__(self, catalogue: Catalogue, *, dof: Dof, calibration: Calibration | None = None) -> None:
+        self._catalogue = catalogue
+        self._dof: Dof = dof
+        self._calibration = calibration or Calibration.load()
+        self._models: dict[str, _Model] = {}
+
+    def warm_up(self) -> None:
+        """Lays out every object, so that the first image waits for nothing."""
+        for label in self._catalogue.objects:
+            self._model(label)
+
+    def assess(self, scene: ObservedScene, objects: Sequence[Judged], log_weights: Floats, winner: int) -> SceneDoubt:
+        """How sure the winning scene is; ``log_weights`` are those of all hypotheses of the image."""
+        constants = self._calibration
+        probabilities = hypothesis_probabilities(log_weights, scene, len(objects), constants.hypothesis_scale)
+        models = [self._model(item.label) for item in objects]
+        layers = [
+            inverse_depth(model.shape.soup, item.T_camera_object, scene.view)
+            for model, item in zip(models, objects, strict=True)
+        ]
+        doubts: list[PoseDoubt] = []
+        for i, item in enumerate(objects):
+            others = np.maximum.reduce([scene.plane_inverse, *layers[:i], *layers[i + 1 :]])
+            look = _Look(scene, models[i], np.array(item.T_camera_object[:3], float), layers[i], others)
+            doubts.append(_judged(look.evidence(item, constants, float(probabilities[winner])), constants))
+        return SceneDoubt(probabilities, tuple(doubts), unknown_regions(scene, layers))
+
+    def _model(self, label: str) -> _Model:
+        if label not in self._models:
+            self._models[label] = _Model(self._catalogue[label], self._dof)
+        return self._models[label]
+
+
+def _judged(evidence: Evidence, constants: Calibration) -> PoseDoubt:
+    """Alternatives keep their odds against the estimate, but share no more than what it leaves to 1."""
+    probability = constants.probability(evidence.features())
+    shares = probability * evidence.relative
+    shares *= min(1.0, (1.0 - probability) / max(float(shares.sum()), 1e-9))
+    return PoseDoubt(evidence, probability, tuple(shares.tolist()), is_contradicted(evidence.looked_through))
+
+
+class _Model:
+    """What is known of one catalogue object."""
+
+    def __init__(self, item: CatalogueObject, dof: Dof) -> None:
+        self.shape = Shape.of(item.simplified(500))
+        self.proposals = Proposals(item, dof)
+        self.symmetries = item.symmetries.transforms()
+        self.dof: Dof = dof
+        self.normals = np.random.default_rng(0).normal(size=(_NEARBY * len(_SCALES), 6))
+        """The same noise for every object: what is compared differs in the image alone."""
+
+
+class _Look:
+    """One object under comparison with other poses of it, everything else in its place."""
+
+    def __init__(self, scene: ObservedScene, model: _Model, pose: Floats, layer: Float32s, others: Float32s) -> None:
+        self._scene = scene
+        self._model = model
+        self._pose = pose
+        self._layer = layer
+        self._others = others
+        self._likelihood = _likelihood(scene, model.shape, pose, others)
+        self._directions = model.proposals.directions(scene.T_camera_table)
+
+    def evidence(self, item: Judged, constants: Calibration, hypothesis: float) -> Evidence:
+        """Everything the image says of the pose."""
+        unit = _PIXEL * constants.pose_scale
+        own = float(self._likelihood.costs(self._pose[None])[0])
+        probes = self._probes(item.rivals)
+        nats = np.clip((self._likelihood.costs(probes) - own) / unit, -_CAP, 50.0)
+        angles, metres = self._apart(probes)
+        away = (angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)
+        near_metres, near_radians = self._spread(own, unit)
+        wide_metres, wide_radians = _profile(nats, metres, angles)
+        chosen = self._alternatives(probes[away], nats[away])
+        fit, shown, visible, gain = self._shown(own)
+        return Evidence(
+            margin=float(nats[away].min(initial=_CAP)),
+            fit=fit,
+            shown=shown,
+            visible=visible,
+            gain=gain,
+            looked_through=looked_through(self._scene, self._layer, self._others),
+            spread_metres=constants.spread_scale * max(near_metres, wide_metres),
+            spread_radians=constants.spread_scale * max(near_radians, wide_radians),
+            hypothesis=hypothesis,
+            confidence=item.confidence,
+            alternatives=probes[away][chosen],
+            relative=np.exp(-np.maximum(nats[away][chosen], 0.0)),
+        )
+
+    def _probes(self, rivals: Floats | None) -> Floats:
+        """Turns about the object's axes (the plane's normal with three degrees of freedom), flips, shifts and
+        rivals; the better ones refined too."""
+        flips = self._model.proposals.all_flips(self._pose, self._scene.T_camera_table)[1:]
+        axes = self._scene.T_camera_table[:3, :3] if self._model.dof == 3 else self._pose[:, :3]
+        spin = axes.T[2:] if self._model.dof == 3 else axes.T
+        slide = axes.T[:2] if self._model.dof == 3 else axes.T
+        turns = exp_so3((spin[:, None] * _TURNS[:, None]).reshape(-1, 3))
+        shifts = (slide[:, None] * _SHIFTS[:, None]).reshape(-1, 3)
+        starts = [flips, self._moved(turns, np.zeros(3)), self._moved(np.eye(3)[None], shifts)]
+        probes = np.concatenate(starts if rivals is None else [*starts, rivals])
+        promising = probes[np.argsort(self._likelihood.costs(probes), kind="stable")[:_REFINED]]
+        refined = self._likelihood.refine(promising, self._directions, steps=4, gate=0.02)
+        return np.concatenate([probes, refined])
+
+    def _spread(self, own: float, unit: float) -> tuple[float, float]:
+        """Standard deviations of position and angle under the tempered likelihood, by importance sampling.
+
+        Samples of three nested normal distributions about the estimate are weighted by exp(-nats) over their density.
+        """
+        normals = self._model.normals[:, : self._directions.shape[1]]
+        turning = np.abs(self._directions[:3]).sum(0) > 0
+        sizes = np.array([np.where(turning, *scale) for scale in _SCALES])
+        steps = normals * np.repeat(sizes, _NEARBY, 0)
+        twists = (self._directions * steps[:, None, :]).sum(-1)
+        poses = self._moved(exp_so3(twists[:, :3]), twists[:, 3:])
+        nats = np.clip((self._likelihood.costs(poses) - own) / unit, -_CAP, 200.0)
+        log_weights = -nats - _log_density(steps, sizes)
+        weights = np.exp(log_weights - log_weights.max())
+        weights /= weights.sum()
+        angles, metres = self._apart(poses)
+        return float(np.sqrt((weights * metres**2).sum())), float(np.sqrt((weights * angles**2).sum()))
+
+    def _alternatives(self, poses: Floats, nats: Floats) -> NDArray[np.intp]:
+        """Indices of the likeliest poses that are apart from one another, modulo symmetry."""
+        kept: list[int] = []
+        likely = np.flatnonzero(nats < -np.log(_LIKELY))
+        order = likely[distinct_best(poses[likely], nats[likely], 64, metres=RIGHT_METRES, radians=RIGHT_RADIANS)]
+        for i in order.tolist():
+            angles, metres = self._between(poses[kept], poses[i])
+            if bool(((angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)).all()):
+                kept.append(i)
+        return np.asarray(kept[:_KEPT], np.intp)
+
+    def _shown(self, own: float) -> tuple[float, float, float, float]:
+        """Mean distance and number of readings that show the object, its visible share, and what it saves."""
+        scene, form = self._scene, _FORM
+        silhouette = self._layer > 0
+        behind = scene.factor * (1.0 / np.where(silhouette, self._layer, 1.0) - scene.depth)
+        shown = silhouette & (self._layer >= self._others) & (behind <= form.occluder_margin)
+        read = shown & (scene.factor > 0)
+        distances = np.minimum(np.abs(behind[read]), form.truncation)
+        fit = float(distances.mean(dtype=np.float64)) if len(distances) else form.truncation
+        count = len(distances) / self._stride**2
+        gain = (self._likelihood.base - own) / (form.truncation * max(1.0, count))
+        return fit, count, float(shown.sum() / max(1, silhouette.sum())), gain
+
+    @property
+    def _stride(self) -> float:
+        return self._scene.view.fx / self._likelihood.window.view.fx
+
+    def _moved(self, turns: Floats, shifts: Floats) -> Floats:
+        """The pose after turns about the object's centre and shifts, both in the camera frame."""
+        rotations = compose(turns, self._pose[None, :, :3])
+        centre = rotate(self._pose[:, :3], self._model.shape.centre) + self._pose[:, 3] + shifts
+        offsets = centre - rotate(rotations, self._model.shape.centre)
+        rotations = np.broadcast_to(rotations, (len(offsets), 3, 3))
+        return np.concatenate([rotations, offsets[..., None]], -1)
+
+    def _apart(self, poses: Floats) -> tuple[Floats, Floats]:
+        return self._between(poses, self._pose)
+
+    def _between(self, poses: Floats, pose: Floats) -> tuple[Floats, Floats]:
+        """Angle modulo symmetry and distance of the centres between poses (P x 3 x 4) and one pose."""
+        centre = self._model.shape.centre
+        angles = symmetry_angle(poses[:, :, :3], pose[None, :, :3], self._model.symmetries)
+        offsets = rotate(poses[:, :, :3], centre) + poses[:, :, 3] - rotate(pose[:, :3], centre) - pose[:, 3]
+        return angles, np.sqrt((offsets**2).sum(-1))
+
+
+def _likelihood(scene: ObservedScene, shape: Shape, pose: Floats, others: Float32s) -> ObjectLikelihood:
+    """Costs of poses about one pose; the window holds the object however it is turned."""
+    centre = rotate(pose[:, :3], shape.centre) + pose[:, 3]
+    z = max(float(centre[2]), 0.1)
+    apparent = shape.diameter / z * scene.view.fx
+    u, v = scene.view.project(np.array([centre[0], centre[1], z])).tolist()
+    reach = 0.55 * apparent + 0.05 / z * scene.view.fx
+    x0, x1 = _span(u, reach, scene.view.width)
+    y0, y1 = _span(v, reach, scene.view.height)
+    region = (x0, y0, x1, y1)
+    stride = max(1, int(apparent / _DETAIL))
+    return ObjectLikelihood(shape, Window.of(scene, others, region, region, stride=stride, form=_FORM), scene, _FORM)
+
+
+def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
+    first = int(np.clip(np.floor(middle - reach), 0, size - 2))
+    return first, int(np.clip(np.ceil(middle + reach), first + 2, size))
+
+
+def _profile(nats: Floats, metres: Floats, angles: Floats) -> tuple[float, float]:
+    """Root mean squares of distance and angle over the probes about the estimate and itself, by weight.
+
+    What is farther away is an alternative, not spread.
+    """
+    about = (angles < _ABOUT[0]) & (metres < _ABOUT[1])
+    nats, metres, angles = nats[about], metres[about], angles[about]
+    weights = np.append(np.exp(-np.maximum(nats, 0.0)), 1.0)
+    weights /= weights.sum()
+    squares = np.stack([np.append(metres, 0.0) ** 2, np.append(angles, 0.0) ** 2])
+    mean = (weights * squares).sum(1)
+    return float(np.sqrt(mean[0])), float(np.sqrt(mean[1]))
+
+
+def _log_density(steps: Floats, sizes: Floats) -> Floats:
+    """Logarithm, up to a constant, of the density of steps (N x D) in a mixture of normals (K x D deviations)."""
+    exponents = -0.5 * ((steps[:, None] / sizes) ** 2).sum(-1) - np.log(sizes).sum(-1)
+    top = exponents.max(1, keepdims=True)
+    return (np.log(np.exp(exponents - top).sum(1, keepdims=True)) + top)[:, 0]

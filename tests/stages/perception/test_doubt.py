@@ -1,0 +1,128 @@
+"""Doubt: sure of what the image shows, unsure of what it leaves open."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runner.contract import Refused
+from stages.perception.doubt import Calibration, Evidence, Judge, Judged, SceneDoubt, hypothesis_probabilities
+from stages.perception.poses import pose
+from stages.scene.catalogue import Floats
+from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
+
+BOX = upright("tea_box", 0.0, 0.0, 0.6)
+HIDDEN_HANDLE, SHOWN_HANDLE = upright("mug", 0.0, 0.0, np.pi / 2), upright("mug", 0.0, 0.0, -0.9)
+
+
+def assess(seen: Rendered, poses: dict[str, Floats] | None = None, *, dof: int = 6) -> SceneDoubt:
+    judged = [Judged(label, T, 0.9) for label, T in (poses or seen.poses).items()]
+    return Judge(CATALOGUE, dof=3 if dof == 3 else 6).assess(seen.scene, judged, np.array([-1.0, -3.0, -9.0]), 0)
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_a_box_in_plain_view_is_sure(dof: int) -> None:
+    (found,) = assess(render({"tea_box": BOX}), dof=dof).objects
+    assert found.probability > 0.9 and not found.alternatives and not found.contradicted
+    assert found.evidence.spread_metres < 0.003 and found.evidence.spread_radians < np.deg2rad(4)
+    assert found.evidence.visible > 0.95
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_a_mug_with_a_hidden_handle_is_in_doubt(dof: int) -> None:
+    (shown,) = assess(render({"mug": SHOWN_HANDLE}), dof=dof).objects
+    (hidden,) = assess(render({"mug": HIDDEN_HANDLE}), dof=dof).objects
+    assert hidden.probability < 0.9 < shown.probability
+    assert hidden.evidence.spread_radians > np.deg2rad(8) > 2 * shown.evidence.spread_radians
+    assert hidden.alternatives and not shown.alternatives
+    # What may be is turned about the upright axis and stands where the estimate stands.
+    (T, up) = hidden.evidence.alternatives[0], render({"mug": HIDDEN_HANDLE}).poses["mug"][:3, 2]
+    assert T[:, 2] @ up > 0.95
+    assert hidden.probability + sum(hidden.alternatives) <= 1 + 1e-9
+
+
+def test_a_flip_that_depth_cannot_see_is_an_alternative() -> None:
+    (found,) = assess(render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)})).objects
+    assert found.evidence.margin < 1
+    upside_down = found.evidence.alternatives[0]
+    assert upside_down[:, 2] @ render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)}).poses["soup_can"][:3, 2] < -0.95
+    # The other end up is another pose, not spread about this one.
+    assert found.evidence.spread_radians < np.deg2rad(10)
+
+
+def test_an_object_that_floats_before_the_readings_is_contradicted() -> None:
+    seen = render({"tea_box": BOX})
+    lifted = {"tea_box": pose(np.eye(3), np.array([0.0, 0.0, -0.1])) @ seen.poses["tea_box"]}
+    (found,) = assess(seen, lifted).objects
+    assert found.contradicted and found.evidence.looked_through > 0.9
+    assert found.probability < 0.2
+
+
+def test_an_object_that_shows_nothing_is_not_contradicted_but_unsure() -> None:
+    seen = render({"milk_carton": upright("milk_carton", 0.0, 0.0, 0.6)})
+    within = {"milk_carton": seen.poses["milk_carton"], "salt_shaker": seen.poses["milk_carton"]}
+    _, hidden = assess(seen, within).objects
+    assert hidden.evidence.visible == 0
+    assert not hidden.contradicted and hidden.probability < 0.5
+
+
+def test_what_the_catalogue_does_not_explain_is_an_unknown_region() -> None:
+    seen = render({"tea_box": BOX, "soup_can": upright("soup_can", -0.13, 0.05, 0.3)})
+    assert assess(seen).unknown == ()
+    (region,) = assess(seen, {"tea_box": seen.poses["tea_box"]}).unknown
+    x0, y0, x1, y1 = seen.boxes["soup_can"]
+    assert region.box[0] >= x0 and region.box[1] >= y0 and region.box[2] <= x1 and region.box[3] <= y1
+    low, high = CATALOGUE["soup_can"].bounds
+    assert region.centre_table == pytest.approx([-0.13, 0.05, (high - low)[2] / 2], abs=0.02)
+    assert (region.extent_table < (high - low) + 0.01).all() and region.points > 300
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.003])
+def test_noise_and_edges_are_no_unknown_objects(noise: float) -> None:
+    placed = {
+        "tea_box": BOX,
+        "bowl": upright("bowl", 0.15, 0.05, 0.0),
+        "tray": upright("tray", 0.0, 0.2, 0.1),
+        "soup_can": upright("soup_can", -0.13, 0.05, 0.3),
+    }
+    assert assess(render(placed, noise=noise)).unknown == ()
+
+
+def test_hypotheses_get_probabilities_that_sum_to_one() -> None:
+    scene = render({"tea_box": BOX}).scene
+    log_weights = np.array([-40.0, -42.0, -60.0, -1e9])
+    found = hypothesis_probabilities(log_weights, scene, 1, 0.05)
+    assert found.sum() == pytest.approx(1) and list(np.argsort(-found)) == [0, 1, 2, 3]
+    assert hypothesis_probabilities(log_weights[:1], scene, 1, 0.05).tolist() == [1.0]
+    assert hypothesis_probabilities(log_weights[:3], scene, 1, 1e12) == pytest.approx(np.full(3, 1 / 3))
+
+
+def test_equal_scenes_are_judged_with_equal_bytes() -> None:
+    seen = render({"mug": HIDDEN_HANDLE, "tea_box": upright("tea_box", 0.12, 0.06, 0.2)})
+    first, second = assess(seen), assess(seen)
+    assert first.probabilities.tobytes() == second.probabilities.tobytes()
+    for a, b in zip(first.objects, second.objects, strict=True):
+        assert a.probability == b.probability and a.alternatives == b.alternatives
+        assert a.evidence.features().tobytes() == b.evidence.features().tobytes()
+
+
+def test_an_empty_scene_is_judged_too() -> None:
+    doubt = Judge(CATALOGUE, dof=6).assess(render({"tea_box": BOX}).scene, [], np.zeros(1), 0)
+    assert doubt.objects == () and doubt.probabilities.tolist() == [1.0] and len(doubt.unknown) == 1
+
+
+def test_better_evidence_is_never_less_sure() -> None:
+    (found,) = assess(render({"mug": HIDDEN_HANDLE})).objects
+    calibration = Calibration.load()
+    evidence: Evidence = found.evidence
+    before = calibration.probability(evidence.features())
+    for change in ({"margin": evidence.margin + 4}, {"gain": evidence.gain + 0.3}, {"looked_through": -0.3}):
+        assert calibration.probability(replace(evidence, **change).features()) >= before
+
+
+def test_constants_of_another_form_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text("bias: much\n")
+    with pytest.raises(Refused, match=r"calibration\.yaml: .*bias"):
+        Calibration.load(path)
