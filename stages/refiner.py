@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
+from stages.perception.doubt import Judge, Judged, annotated
 from stages.perception.likelihood import ObservedScene
 from stages.perception.poses import pose
 from stages.perception.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
@@ -40,8 +42,11 @@ class Refiner(Stage):
         self._refiner: SceneRefiner | None = None
         if config.form == "default":
             settings = RefinementSettings(dof=config.dof)
-            self._refiner = SceneRefiner(Catalogue.load(Path(config.catalogue)), settings)
+            catalogue = Catalogue.load(Path(config.catalogue))
+            self._refiner = SceneRefiner(catalogue, settings)
             self._refiner.warm_up()
+            self._judge = Judge(catalogue, dof=config.dof)
+            self._judge.warm_up()
 
     def on_scene_estimate(self, scene_estimate: SceneEstimate, observation: Observation, ctx: Context) -> SceneEstimate:
         """The same objects at better poses."""
@@ -50,8 +55,15 @@ class Refiner(Stage):
         scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
         placed = [Placed(item.label, item.T_camera_object) for item in scene_estimate.objects]
         refined = self._refiner.refine(scene, observation.rgb, placed)
+        judged = tuple(map(_judged, scene_estimate.objects, refined.objects))
+        doubt = self._judge.assess(scene, judged, scene_estimate.log_weights, scene_estimate.winner)
         objects = tuple(map(_object, scene_estimate.objects, refined.objects))
-        return msgspec.structs.replace(scene_estimate, objects=objects)
+        return annotated(msgspec.structs.replace(scene_estimate, objects=objects), doubt)
+
+
+def _judged(item: ObjectPose, refined: RefinedObject) -> Judged:
+    rivals = [alternative.T_camera_object for alternative in refined.alternatives[1:]]
+    return Judged(refined.label, refined.T_camera_object, item.confidence, np.array(rivals) if rivals else None)
 
 
 def _object(item: ObjectPose, refined: RefinedObject) -> ObjectPose:

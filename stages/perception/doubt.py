@@ -18,8 +18,10 @@ import yaml
 from numpy.typing import NDArray
 
 from runner.contract import Refused
+from stages.messages.digest import SceneEstimate
+from stages.messages.scene import Alternative, ObjectPose, UnknownRegion
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.poses import compose, exp_so3, rotate, symmetry_angle
+from stages.perception.poses import compose, exp_so3, pose, rotate, symmetry_angle
 from stages.perception.proposals import Dof, Proposals, distinct_best
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.perception.unexplained import Region, is_contradicted, looked_through, unknown_regions
@@ -175,6 +177,34 @@ def hypothesis_probabilities(log_weights: Floats, scene: ObservedScene, objects:
     nats = (log_weights - log_weights.max()) / (CostForm().truncation * share * scale)
     weights = np.exp(nats)
     return weights / weights.sum()
+
+
+def annotated(estimate: SceneEstimate, doubt: SceneDoubt) -> SceneEstimate:
+    """The estimate with all that is known of how sure it is."""
+    objects = tuple(map(_annotated, estimate.objects, doubt.objects))
+    unknown = tuple(
+        UnknownRegion(
+            box=region.box, points=region.points, centre_table=region.centre_table, extent_table=region.extent_table
+        )
+        for region in doubt.unknown
+    )
+    return msgspec.structs.replace(estimate, objects=objects, probabilities=doubt.probabilities, unknown=unknown)
+
+
+def _annotated(item: ObjectPose, found: PoseDoubt) -> ObjectPose:
+    evidence = found.evidence
+    return msgspec.structs.replace(
+        item,
+        probability=found.probability,
+        spread_metres=evidence.spread_metres,
+        spread_radians=evidence.spread_radians,
+        alternatives=tuple(
+            Alternative(T_camera_object=pose(T[:, :3], T[:, 3]), probability=share)
+            for T, share in zip(evidence.alternatives, found.alternatives, strict=True)
+        ),
+        looked_through=evidence.looked_through,
+        contradicted=found.contradicted,
+    )
 
 
 class Judge:

@@ -50,7 +50,19 @@ def test_poses_come_closer_and_all_else_stays(seen: Rendered) -> None:
     for item in after.objects:
         assert item.T_camera_object[:3, 3] == pytest.approx(seen.poses[item.name][:3, 3], abs=0.0015)
         assert item.cost < 0.002 and 0.5 < item.visible <= 1.0
-    assert msgspec.structs.replace(after, objects=before.objects) == before
+    assert msgspec.structs.replace(after, objects=before.objects, probabilities=None, unknown=()) == before
+
+
+def test_the_scene_is_judged(seen: Rendered) -> None:
+    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+    after = stage.on_scene_estimate(estimate(seen), observation(seen), Recorded())
+    assert after.probabilities is not None and after.probabilities.sum() == pytest.approx(1)
+    assert all(item.probability is not None and item.spread_metres > 0 for item in after.objects)
+    assert after.unknown == ()
+    (region,) = stage.on_scene_estimate(
+        msgspec.structs.replace(estimate(seen), objects=after.objects[:1]), observation(seen), Recorded()
+    ).unknown
+    assert region.points > 300
 
 
 def test_the_plain_form_passes_the_scene_on(seen: Rendered) -> None:
