@@ -3,36 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.datasets import ImageId, Truth, read_truth
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
 from stages.perception.metrics import add_s, is_near_flip, pose_errors
-from stages.perception.poses import pose
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _POINTS = 2000
 _FLIP = np.deg2rad(15.0)
-Image = tuple[int, int]
-"""scene_id, im_id."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """One object as the data set has it."""
-
-    image: Image
-    label: int
-    T_camera_object: Floats
 
 
 @dataclass(frozen=True)
@@ -50,30 +36,10 @@ class Score:
         return self.metres < metres and self.radians < np.deg2rad(degrees)
 
 
-def read_truth(dataset: Path) -> list[Truth]:
-    """Every object of every image of a BOP data set, metres.
-
-    Raises:
-        Refused: the folder has no ground truth.
-    """
-    files = sorted(dataset.glob("test/*/scene_gt.json"))
-    if not files:
-        raise Refused(f"{dataset}: no test/*/scene_gt.json; a BOP data set is expected")
-    return [truth for file in files for truth in _scene_truth(int(file.parent.name), json.loads(file.read_text()))]
-
-
-def _scene_truth(scene: int, content: dict[str, list[dict[str, Any]]]) -> Iterable[Truth]:
-    for image, items in content.items():
-        for item in items:
-            R = np.array(item["cam_R_m2c"], float).reshape(3, 3)
-            T = pose(R, np.array(item["cam_t_m2c"], float) / 1000)
-            yield Truth((scene, int(image)), int(item["obj_id"]), T)
-
-
 def score(truths: list[Truth], results: list[Result], catalogue: Catalogue) -> list[Score]:
     """One score per true object against the results of its image and label, each result used once."""
     items = {item.label: item for item in catalogue.objects.values()}
-    groups: dict[tuple[Image, int], tuple[list[Truth], list[Result]]] = defaultdict(lambda: ([], []))
+    groups: dict[tuple[ImageId, int], tuple[list[Truth], list[Result]]] = defaultdict(lambda: ([], []))
     for truth in truths:
         groups[truth.image, truth.label][0].append(truth)
     for result in results:

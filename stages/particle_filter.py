@@ -38,6 +38,8 @@ class ParticleFilter(Stage):
         lambda_r: float = 1.0
         """Scale of equation 8 in the weights by which hypotheses are ranked, per metre and pixel."""
         seed: int = 0
+        without: tuple[str, ...] = ()
+        """Improvements over the paper's plain form that are switched off, each by its name."""
 
         def __post_init__(self) -> None:
             if self.form not in ("default", "paper"):
@@ -53,7 +55,9 @@ class ParticleFilter(Stage):
     def __init__(self, config: Config) -> None:
         self.config = config
         make = FilterSettings.paper if config.form == "paper" else FilterSettings
-        settings = make(particles=config.particles, iterations=config.iterations, dof=config.dof)
+        settings = make(particles=config.particles, iterations=config.iterations, dof=config.dof).without(
+            *config.without
+        )
         self._filter = SceneFilter(Catalogue.load(Path(config.catalogue)), settings, seed=config.seed)
         self._filter.warm_up()
 

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import Truth, read_truth, right_sets, score, table
+from benchmarks.accuracy import right_sets, score, table
+from benchmarks.datasets import Truth, read_truth
 from runner.contract import Finished, Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
