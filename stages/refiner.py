@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
-import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
-from stages.perception.doubt import Judge, Judged, annotated
+from stages.perception.doubt import Judge, Judged, Rival, annotated
 from stages.perception.likelihood import ObservedScene
 from stages.perception.poses import pose
 from stages.perception.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
@@ -62,8 +61,10 @@ class Refiner(Stage):
 
 
 def _judged(item: ObjectPose, refined: RefinedObject) -> Judged:
-    rivals = [alternative.T_camera_object for alternative in refined.alternatives[1:]]
-    return Judged(refined.label, refined.T_camera_object, item.confidence, np.array(rivals) if rivals else None)
+    mine, *others = refined.considered or (None,)
+    own = None if mine is None else mine.colour
+    rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
+    return Judged(refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals))
 
 
 def _object(item: ObjectPose, refined: RefinedObject) -> ObjectPose:

@@ -38,6 +38,8 @@ _DETAIL = 60.0
 _FORM = CostForm().truncated(0.015)
 _PIXEL = 0.003
 """Metres by which a reading that speaks against a pose is off, for the unit of evidence."""
+_COLOUR = 0.5
+"""CIELAB units of mean distance that count as one nat."""
 _TURNS = np.deg2rad(np.arange(10.0, 360.0, 10.0))
 _SHIFTS = np.array([-0.05, -0.03, -0.015, 0.015, 0.03, 0.05])
 _REFINED = 40
@@ -91,6 +93,16 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """A pose that depth found nearly equal to the estimate."""
+
+    T_camera_object: Floats
+    """3 x 4."""
+    colour: float
+    """By how much its colours are farther from the image than the estimate's, CIELAB units; 0 where colour is mute."""
+
+
+@dataclass(frozen=True)
 class Judged:
     """An object of the winning scene whose pose is to be judged."""
 
@@ -99,8 +111,8 @@ class Judged:
     """3 x 4 or 4 x 4."""
     confidence: float
     """The detector's."""
-    rivals: Floats | None = None
-    """R x 3 x 4: other poses that the estimator considered."""
+    rivals: tuple[Rival, ...] = ()
+    """Other poses that the estimator considered."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +292,8 @@ class _Look:
         unit = _PIXEL * constants.pose_scale
         own = float(self._likelihood.costs(self._pose[None])[0])
         probes = self._probes(item.rivals)
-        nats = np.clip((self._likelihood.costs(probes) - own) / unit, -_CAP, 50.0)
+        nats = (self._likelihood.costs(probes) - own) / unit + self._colour(probes, item.rivals)
+        nats = np.clip(nats, -_CAP, 50.0)
         angles, metres = self._apart(probes)
         away = (angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)
         near_metres, near_radians = self._spread(own, unit)
@@ -302,7 +315,15 @@ class _Look:
             relative=np.exp(-np.maximum(nats[away][chosen], 0.0)),
         )
 
-    def _probes(self, rivals: Floats | None) -> Floats:
+    def _colour(self, probes: Floats, rivals: Sequence[Rival]) -> Floats:
+        """What colour says against each probe, nats: what it says against the rival that is nearly the same."""
+        nats = np.zeros(len(probes))
+        for rival in rivals:
+            angles, metres = self._between(probes, rival.T_camera_object)
+            nats[(angles < RIGHT_RADIANS) & (metres < RIGHT_METRES)] = rival.colour / _COLOUR
+        return nats
+
+    def _probes(self, rivals: Sequence[Rival]) -> Floats:
         """Turns about the object's axes (the plane's normal with three degrees of freedom), flips, shifts and
         rivals; the better ones refined too."""
         flips = self._model.proposals.all_flips(self._pose, self._scene.T_camera_table)[1:]
@@ -312,7 +333,7 @@ class _Look:
         turns = exp_so3((spin[:, None] * _TURNS[:, None]).reshape(-1, 3))
         shifts = (slide[:, None] * _SHIFTS[:, None]).reshape(-1, 3)
         starts = [flips, self._moved(turns, np.zeros(3)), self._moved(np.eye(3)[None], shifts)]
-        probes = np.concatenate(starts if rivals is None else [*starts, rivals])
+        probes = np.concatenate([*starts, *(rival.T_camera_object[None] for rival in rivals)])
         promising = probes[np.argsort(self._likelihood.costs(probes), kind="stable")[:_REFINED]]
         refined = self._likelihood.refine(promising, self._directions, steps=4, gate=0.02)
         return np.concatenate([probes, refined])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
-from stages.perception.doubt import Calibration, Evidence, Judge, Judged, SceneDoubt, hypothesis_probabilities
+from stages.perception.doubt import Calibration, Evidence, Judge, Judged, Rival, SceneDoubt, hypothesis_probabilities
 from stages.perception.poses import pose
 from stages.scene.catalogue import Floats
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
@@ -49,6 +49,18 @@ def test_a_flip_that_depth_cannot_see_is_an_alternative() -> None:
     assert upside_down[:, 2] @ render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)}).poses["soup_can"][:3, 2] < -0.95
     # The other end up is another pose, not spread about this one.
     assert found.evidence.spread_radians < np.deg2rad(10)
+
+
+def test_colour_settles_what_depth_cannot_see() -> None:
+    seen = render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)})
+    T = seen.poses["soup_can"]
+    flipped = (T @ pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3)))[:3]
+    before, after = (
+        Judge(CATALOGUE, dof=6).assess(seen.scene, [Judged("soup_can", T, 0.9, rivals)], np.zeros(1), 0).objects[0]
+        for rivals in ((), (Rival(flipped, colour=5.0),))
+    )
+    assert after.probability > before.probability and after.evidence.margin > before.evidence.margin + 3
+    assert before.alternatives and not after.alternatives
 
 
 def test_an_object_that_floats_before_the_readings_is_contradicted() -> None:
