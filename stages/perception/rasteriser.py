@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from numpy import ceil, floor
 from numpy.typing import NDArray
 
 from stages.perception.pixel_math import INLINED, KERNEL, NEAR, screen_matrix, triangle_setup
@@ -141,8 +142,8 @@ def screen_bounds(corners, m, view):
         near = min(near, depth)
     if near < _f(NEAR):
         return view[4] + _f(1), _f(0), _f(0), _f(0)
-    return (max(_f(0), np.ceil(u0)), max(_f(0), np.ceil(v0)),
-            min(view[4] - _f(1), np.floor(u1)), min(view[5] - _f(1), np.floor(v1)))  # fmt: skip
+    return (max(_f(0), ceil(u0)), max(_f(0), ceil(v0)),
+            min(view[4] - _f(1), floor(u1)), min(view[5] - _f(1), floor(v1)))  # fmt: skip
 
 
 @numba.njit(**INLINED)
