@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
 from stages.messages.digest import ParticleTrace
+from stages.perception.evaluators import DEVICES, chosen_device
 from stages.perception.likelihood import ObservedScene
 from stages.perception.particle_filter import FilterSettings, Track
 from stages.perception.poses import pose
@@ -40,10 +41,14 @@ class ParticleFilter(Stage):
         seed: int = 0
         without: tuple[str, ...] = ()
         """Improvements over the paper's plain form that are switched off, each by its name."""
+        device: Literal["auto", "cpu", "cuda"] = "cpu"
+        """What weighs the particles. ``auto`` takes a GPU where there is one; its costs differ in the last bits."""
 
         def __post_init__(self) -> None:
             if self.form not in ("default", "paper"):
                 raise Refused(f"particle_filter.form is '{self.form}'; choose default or paper")
+            if self.device not in DEVICES:
+                raise Refused(f"particle_filter.device is '{self.device}'; choose auto, cpu or cuda")
             if self.dof not in (3, 6):
                 raise Refused(f"particle_filter.dof is {self.dof}; choose 3 or 6")
             for name, least in (("particles", 25), ("iterations", 1)):
@@ -58,6 +63,7 @@ class ParticleFilter(Stage):
         settings = make(particles=config.particles, iterations=config.iterations, dof=config.dof).without(
             *config.without
         )
+        settings = replace(settings, device=chosen_device(config.device, place="particle_filter.device"))
         self._filter = SceneFilter(Catalogue.load(Path(config.catalogue)), settings, seed=config.seed)
         self._filter.warm_up()
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from stages.perception.evaluators import Device, cuda_evaluator
 from stages.perception.kernels import change_of_cost, gauss_newton
 from stages.perception.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.scene.catalogue import Floats, Mesh
@@ -180,7 +181,9 @@ def credits(scene: ObservedScene, background: Float32s, form: CostForm) -> Float
 class ObjectLikelihood:
     """Costs of poses of one object in one window; owns the kernel's working memory."""
 
-    def __init__(self, shape: Shape, window: Window, scene: ObservedScene, form: CostForm) -> None:
+    def __init__(
+        self, shape: Shape, window: Window, scene: ObservedScene, form: CostForm, *, device: Device = "cpu"
+    ) -> None:
         self.shape = shape
         self.window = window
         self.form = form
@@ -189,9 +192,14 @@ class ObjectLikelihood:
         self._scratch = shape.soup.scratch()
         self.base = float(window.credit.sum(dtype=np.float64))
         """Cost of the window without the object."""
+        self._on_gpu = None if device == "cpu" else cuda_evaluator(shape, window, scene.plane, form)
 
     def costs(self, poses: Floats) -> Floats:
         """d(R, O) of equation 9 in metres times pixels for poses P x 3 x 4 (rows of T_camera_object)."""
+        change = self._on_gpu or self._on_cpu
+        return self.base + change(poses).astype(np.float64)
+
+    def _on_cpu(self, poses: Floats) -> Float32s:
         out = np.zeros(len(poses), np.float32)
         soup, window, form = self.shape.soup, self.window, self.form
         limits = np.array([form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack], np.float32)
@@ -200,7 +208,7 @@ class ObjectLikelihood:
             window.view.numbers, window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
             window.credit.ravel(), self._plane, limits, self._z_buffer, self._scratch, out,
         )  # fmt: skip
-        return self.base + out.astype(np.float64)
+        return out
 
     def energies(self, poses: Floats) -> Floats:
         """Costs and what the candidate's box says against a pose, by which particles are weighted, P.

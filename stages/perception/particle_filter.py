@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Refused
+from stages.perception.evaluators import Device
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window, credits
 from stages.perception.proposals import Dof, Guess, Proposals, distinct_best
 from stages.perception.rasteriser import Float32s
@@ -69,6 +70,8 @@ class FilterSettings:
     """Objects that reach into one another, or that nothing supports, cost something."""
     colour: bool = True
     """Colour decides between poses that depth cannot tell apart."""
+    device: Device = "cpu"
+    """Where the filter's particles are weighed; polish runs on the CPU in either case."""
 
     def without(self, *improvements: str) -> FilterSettings:
         """These settings with improvements over the paper's plain form switched off, each by its name.
@@ -202,7 +205,7 @@ class ObjectFilter:
         def likelihood(shape: Shape, detail: float, form: CostForm) -> ObjectLikelihood:
             stride = max(1, int(apparent / detail))
             window = Window.of(scene, background, box, region, stride=stride, form=form)
-            return ObjectLikelihood(shape, window, scene, form)
+            return ObjectLikelihood(shape, window, scene, form, device=settings.device)
 
         rough = self.coarse if settings.coarse_pixels else self.fine
         first = likelihood(rough, settings.coarse_pixels or settings.fine_pixels, settings.cost)
