@@ -17,6 +17,9 @@ _REFITS = 4
 _REACH = 0.2
 """Metres from an object within which its support plane shows."""
 _LEADERS = 12
+_FEWEST = 100
+_SHARE = 0.1
+"""Of the readings near the objects as many must lie on the support plane; on real tables a third and more do."""
 _BELOW = 0.5
 """What a reading below the plane takes away, in readings on it."""
 _TALLEST = 0.3
@@ -31,14 +34,17 @@ def find_plane(
     ``depth`` is H x W metres (0 invalid), ``objects`` C x 4 spheres in which objects may be (middle and radius, camera
     frame, metres), ``up`` the direction against gravity in the camera frame where it is known. Of the planes near the
     objects that one wins which most readings agree with and most objects stand on. None where there are too few
-    readings.
+    readings, or none that agree on a plane.
     """
     points = _points(depth, view, objects)
-    if len(points) < 100:
+    if len(points) < _FEWEST:
         return None
     sample = points[rng.choice(len(points), min(_SAMPLES, len(points)), replace=False)]
-    plane = _refit(_best_trial(sample, objects[:, :3], rng, up), points)
-    return _frame(plane, points)
+    best = _best_trial(sample, objects[:, :3], rng, up)
+    if best is None:
+        return None
+    plane = _refit(best, points)
+    return _frame(plane, points) if _near(plane, points).mean() >= _SHARE else None
 
 
 def height_above(depth: Float32s, view: View, T_camera_table: Floats) -> Float32s:
@@ -62,11 +68,11 @@ def _points(depth: Float32s, view: View, objects: Floats) -> Floats:
     return points[near] if near.any() else points
 
 
-def _best_trial(points: Floats, middles: Floats, rng: np.random.Generator, up: Floats | None) -> Floats:
+def _best_trial(points: Floats, middles: Floats, rng: np.random.Generator, up: Floats | None) -> Floats | None:
     """Of planes (unit normal towards the camera, offset) through three points the one with the best score."""
     planes = _through(points[rng.integers(len(points), size=(_TRIALS, 3))], up)
     if not len(planes):
-        return np.array([0.0, 0.0, -1.0, float(np.median(points[:, 2]))])
+        return None
     scores = _scores(planes, points, middles)
     leaders = planes[np.argsort(-scores, kind="stable")[:_LEADERS]]
     refitted = np.stack([_refit(plane, points) for plane in leaders])
@@ -100,10 +106,15 @@ def _through(corners: Floats, up: Floats | None) -> Floats:
     return np.column_stack([normals, -(normals * corners[:, 0]).sum(1)])[allowed]
 
 
+def _near(plane: Floats, points: Floats, share: float = 1.0) -> NDArray[np.bool_]:
+    """Which points lie on a plane, within a share of the noise."""
+    return np.abs((points * plane[:3]).sum(1) + plane[3]) < share * noise(points[:, 2])
+
+
 def _refit(plane: Floats, points: Floats) -> Floats:
     """Least squares over the readings that agree, repeated with a falling tolerance."""
     for share in np.linspace(1.0, 0.6, _REFITS):
-        near = points[np.abs((points * plane[:3]).sum(1) + plane[3]) < share * noise(points[:, 2])]
+        near = points[_near(plane, points, share)]
         if len(near) < 3:
             break
         centre = near.mean(0)
@@ -120,8 +131,7 @@ def _frame(plane: Floats, points: Floats) -> Floats:
     normal = plane[:3]
     x: Floats = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     x /= np.sqrt((x**2).sum())
-    near = points[np.abs((points * normal).sum(1) + plane[3]) < noise(points[:, 2])]
-    centre = near.mean(0) if len(near) else points.mean(0)
+    centre = points[_near(plane, points)].mean(0)
     origin = centre - ((centre * normal).sum() + plane[3]) * normal
     y: Floats = np.cross(normal, x)
     return pose(np.stack([x, y, normal], 1), origin)

@@ -26,14 +26,15 @@ def preprocess(
     """Cuts a frame down to the working area around the candidates and finds its support plane.
 
     Raises:
-        Refused: there is no plane because there are hardly any readings.
+        Refused: there are hardly any readings, or no plane among them.
     """
-    depth = np.where(working_area(frame, candidates), frame.depth, np.float32(0))
+    measured = np.isfinite(frame.depth) & (frame.depth > 0)
+    depth = np.where(working_area(frame, candidates) & measured, frame.depth, np.float32(0))
     view = View.of(frame.K, depth.shape[1], depth.shape[0])
     up = None if frame.T_base_camera is None else frame.T_base_camera[2, :3]
     T_camera_table = find_plane(depth, view, rng, objects=_spheres(depth, view, candidates), up=up)
     if T_camera_table is None:
-        raise Refused(f"{frame.name}: no support plane; the depth image has {int((depth > 0).sum())} readings there")
+        raise Refused(_no_plane(frame, depth))
     height = height_above(depth, view, T_camera_table)
     foreground = (depth > 0) & (height > noise(depth) + _CLEARANCE) & (height < max_height)
     return Observation(
@@ -46,6 +47,15 @@ def preprocess(
         scene_id=frame.scene_id,
         image_id=frame.image_id,
         name=frame.name,
+    )
+
+
+def _no_plane(frame: Frame, depth: Float32s) -> str:
+    around = int((depth > 0).sum())
+    level = "" if frame.T_base_camera is None else " that is level"
+    return (
+        f"{frame.name}: no support plane{level}; the depth image has {int((frame.depth > 0).sum())} readings, {around} "
+        "of them around the candidates, and a support plane needs 100 and a tenth of those near the objects"
     )
 
 

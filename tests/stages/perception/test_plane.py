@@ -1,16 +1,24 @@
 """The support plane, rendered and real."""
 
 import json
+from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from runner.contract import Refused
+from stages.devices.bop import read_dataset
+from stages.devices.bop_detections import read_detections
 from stages.messages import Candidate, Frame
 from stages.perception.plane import find_plane, height_above
-from stages.perception.poses import inverse
+from stages.perception.poses import inverse, pose
 from stages.perception.preprocessing import preprocess
-from tests.stages.perception.scenes import DATA, VIEW, camera, render, upright
+from stages.scene.catalogue import Catalogue
+from tests.stages.perception.scenes import DATA, VIEW, K, camera, render, upright
 
 PLACED = {"mug": upright("mug", 0.0, 0.0, 0.6), "tray": upright("tray", 0.1, 0.1, 0.2)}
 
@@ -50,12 +58,73 @@ def test_heights_are_above_the_plane() -> None:
     assert np.abs(height[table]).max() < 1e-3
 
 
-def test_too_few_readings_give_no_plane() -> None:
-    depth = np.zeros((VIEW.height, VIEW.width), np.float32)
-    assert find_plane(depth, VIEW, np.random.default_rng(0), objects=np.zeros((0, 4)), up=None) is None
+NOTHING = np.zeros((VIEW.height, VIEW.width), np.float32)
+CLOUD = np.random.default_rng(1).uniform(0.4, 1.4, NOTHING.shape).astype(np.float32)
+LINE = np.where(np.arange(VIEW.height)[:, None] == 120, np.float32(0.8), np.float32(0)) + NOTHING
 
 
-@pytest.mark.parametrize("scene", [1, 2, 3])
+@pytest.mark.parametrize("depth", [NOTHING, CLOUD, LINE], ids=["no readings", "no plane", "one line"])
+@pytest.mark.parametrize("up", [None, np.array([0.0, -1.0, 0.0])], ids=["", "gravity known"])
+def test_no_plane_is_found_where_none_is(depth: np.ndarray, up: np.ndarray | None) -> None:
+    assert find_plane(depth, VIEW, np.random.default_rng(0), objects=np.zeros((0, 4)), up=up) is None
+
+
+@given(pitch=st.floats(0.25, 1.5), distance=st.floats(0.5, 1.5), seed=st.integers(0, 100))
+@settings(max_examples=12, deadline=None)
+def test_an_empty_table_is_found_from_anywhere(pitch: float, distance: float, seed: int) -> None:
+    truth = camera(distance=distance, pitch=pitch)
+    rng = np.random.default_rng(seed)
+    rays, normal = VIEW.rays(), truth[:3, 2]
+    slope = (rays * normal).sum(-1)
+    depth = np.where(slope < -0.05, (normal @ truth[:3, 3]) / np.minimum(slope, -0.05), 0.0)
+    depth = np.where((depth > 0) & (depth < 3), depth + rng.normal(0, 0.002, depth.shape), 0).astype(np.float32)
+    T = find_plane(depth, VIEW, rng, objects=np.array([[*truth[:3, 3], 0.1]]), up=None)
+    assert T is not None
+    assert tilt(T, truth) < 0.3
+    assert abs((inverse(truth) @ T)[2, 3]) < 0.002
+
+
+def frame_of(depth: np.ndarray, **known: np.ndarray | None) -> Frame:
+    given = {"T_base_camera": None, "robot_mask": None} | known
+    return Frame(rgb=np.zeros((*depth.shape, 3), np.uint8), depth=depth, K=K, name="scene 7 image 3", index=0, total=1,
+                 **given)  # fmt: skip
+
+
+@pytest.mark.parametrize("depth", [NOTHING, CLOUD, LINE, NOTHING * np.nan], ids=["none", "cloud", "line", "nan"])
+def test_an_image_without_a_plane_is_refused_in_one_line(depth: np.ndarray) -> None:
+    with pytest.raises(Refused, match="scene 7 image 3: no support plane; the depth image has") as refusal:
+        preprocess(frame_of(depth), [], np.random.default_rng(0), max_height=0.6)
+    assert "\n" not in str(refusal.value)
+
+
+def truths(name: str) -> list[tuple[Path, np.ndarray]]:
+    """Images with a known camera in the world, whose table is z = 0: depth file and T_camera_world."""
+    found: list[tuple[Path, np.ndarray]] = []
+    for file in sorted((DATA / name / "test").glob("*/scene_camera.json")):
+        for number, entry in json.loads(file.read_text()).items():
+            T = pose(np.reshape(entry["cam_R_w2c"], (3, 3)), np.array(entry["cam_t_w2c"]) / 1000)
+            found.append((file.parent / "depth" / f"{int(number):06d}.png", T))
+    return found
+
+
+@pytest.mark.parametrize("name", ["household-layout", "clutter-ycb"])
+def test_tables_of_the_data_sets(name: str) -> None:
+    if not (DATA / name).exists():
+        pytest.skip("the data sets are not beside the repository (../shared/data)")
+    names = {item.label: item.name for item in Catalogue.load(DATA / name / "models").objects.values()}
+    boxes = list(read_detections(DATA / name / "detections_exact.json", names))
+    cameras = {(image.scene_id, image.image_id): image for image in read_dataset(DATA / name)}
+    for file, T_camera_world in truths(name)[::4]:
+        image = cameras[int(file.parent.parent.name), int(file.stem)]
+        here = [box for box in boxes if (box.scene_id, box.image_id) == (image.scene_id, image.image_id)]
+        candidates = [Candidate(box=box.box, label=box.label, confidence=1.0) for box in here]
+        frame = msgspec.structs.replace(frame_of(image.read()[1]), K=image.K)
+        seen = preprocess(frame, candidates, np.random.default_rng(0), max_height=0.6)
+        assert tilt(seen.T_camera_table, T_camera_world) < 0.1
+        assert abs((inverse(T_camera_world) @ seen.T_camera_table)[2, 3]) < 0.002
+
+
+@pytest.mark.parametrize("scene", [1, 2, 3, 4, 5])
 def test_real_tables(scene: int) -> None:
     folder = DATA / "ycb-real" / "test" / f"{scene:06d}"
     if not folder.exists():
