@@ -12,6 +12,7 @@ from runner.contract import Context, Refused, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
 from stages.perception.doubt import Judge, Judged, Rival, annotated
 from stages.perception.likelihood import ObservedScene
+from stages.perception.particle_filter import FilterSettings
 from stages.perception.poses import pose
 from stages.perception.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
@@ -22,13 +23,15 @@ class Refiner(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """Settings; ``catalogue``, ``form`` and ``dof`` are those of the particle filter."""
+        """Settings: those of the particle filter."""
 
         catalogue: str
         """A catalogue's YAML file, or a BOP ``models`` folder."""
         form: Literal["default", "paper"] = "default"
         """``paper`` passes the ranked scene on as it is."""
         dof: Literal[3, 6] = 6
+        without: tuple[str, ...] = ()
+        """Improvements over the paper's plain form that are switched off."""
 
         def __post_init__(self) -> None:
             if self.form not in ("default", "paper"):
@@ -40,7 +43,7 @@ class Refiner(Stage):
         self.config = config
         self._refiner: SceneRefiner | None = None
         if config.form == "default":
-            settings = RefinementSettings(dof=config.dof)
+            settings = RefinementSettings.of(FilterSettings(dof=config.dof).without(*config.without))
             catalogue = Catalogue.load(Path(config.catalogue))
             self._refiner = SceneRefiner(catalogue, settings)
             self._refiner.warm_up()

@@ -9,19 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.perception.colour import Contender, Paint, Verdict, judge
+from stages.perception.contact import Solid, apparent, contacts, penalty
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.particle_filter import Rectangle
+from stages.perception.particle_filter import FilterSettings, Rectangle
+from stages.perception.poses import symmetry_angle
 from stages.perception.proposals import Dof, Proposals
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.perception.scene_filter import scene_cost
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
-_GAIN = 1e-3
-"""Share of its own cost by which a moved object must lower the scene's."""
+_GAIN = 5e-6
+"""Metres per visible pixel by which a moved object must lower the scene's cost."""
+_SAME = np.deg2rad(12.0)
+"""Two poses closer than this, modulo symmetry, are one."""
+_PROMISING = 6
+"""Flips that are polished in full."""
+_YAW_STEP = np.deg2rad(15.0)
+"""Between the turns about a continuous axis at which an object's colours are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +43,27 @@ class RefinementSettings:
     triangles: int = 2000
     """Detail of the meshes."""
     rounds: int = 3
-    """Times that every object is polished at most, the others fixed."""
+    """Times that every object is polished at most, the others fixed; 0 leaves the poses where they are."""
     steps: int = 6
     """Gauss-Newton steps of a polish."""
     gate: float = 0.01
     """Metres between a reading and the surface beyond which it takes no part in a polish."""
+    contact: bool = True
+    """Penetration and floating cost."""
+    colour: bool = True
+    """Colour decides between poses that depth finds equal."""
+    equal: float = 0.5
+    """Depth finds poses equal whose costs differ by less than this share of the mean distance of the visible pixels
+    at the better one: by less than what the sensor's noise and the mesh's errors leave of any pose."""
+
+    @staticmethod
+    def of(filter_settings: FilterSettings) -> RefinementSettings:
+        """As the filter is set: what is switched off there is switched off here."""
+        chosen = filter_settings
+        rounds = RefinementSettings.rounds if chosen.joint else 0
+        return RefinementSettings(
+            dof=chosen.dof, cost=chosen.cost, rounds=rounds, contact=chosen.contact, colour=chosen.colour
+        )
 
 
 @dataclass(frozen=True)
@@ -50,13 +76,15 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Alternative:
-    """A pose that was considered."""
+class Considered:
+    """A pose that was compared with its flips, the other objects fixed."""
 
     T_camera_object: Floats
     """3 x 4."""
     depth: float
-    """What it adds to the cost of the scene, metres times pixels."""
+    """By how much the scene costs more (metres times pixels, contact included) than at the cheapest pose."""
+    colour: float | None
+    """Mean distance of its colours from the image, CIELAB units; None where colour was not asked or saw too little."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +100,8 @@ class RefinedObject:
     """Mean distance over the pixels that show it, metres, bounded."""
     visible: float
     """Share of its silhouette that nothing hides."""
-    alternatives: tuple[Alternative, ...]
-    """What was chosen first, then the other poses that were considered, cheapest first."""
+    considered: tuple[Considered, ...]
+    """The poses that depth found equal: the chosen one first, then the others, cheapest first."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +127,12 @@ class SceneRefiner:
             self._model(label)
 
     def refine(self, scene: ObservedScene, rgb: NDArray[np.uint8], placed: Sequence[Placed]) -> RefinedScene:
-        """Polishes all objects together; ``rgb`` is H x W x 3, sRGB, registered to the depth image."""
+        """Polishes all objects together and settles flips; ``rgb`` is H x W x 3, sRGB, registered to the depth."""
         poses = [np.array(item.T_camera_object[:3], float) for item in placed]
         joint = _Joint(scene, [self._model(item.label) for item in placed], poses, self._settings)
         joint.polish()
+        if joint.settle(rgb):
+            joint.polish()
         return joint.result()
 
     def _model(self, label: str) -> _Model:
@@ -116,8 +146,29 @@ class _Model:
 
     def __init__(self, item: CatalogueObject, settings: RefinementSettings) -> None:
         self.label = item.name
+        self.item = item
         self.shape = Shape.of(item.simplified(settings.triangles))
         self.proposals = Proposals(item, settings.dof)
+        self.symmetries = item.symmetries.transforms(_YAW_STEP)
+
+    @cached_property
+    def solid(self) -> Solid:
+        """For contacts."""
+        return Solid.of(self.item)
+
+    @cached_property
+    def paint(self) -> Paint:
+        """The full mesh's colours."""
+        return Paint.of(self.item.mesh)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """One object's surroundings while all others stay where they are."""
+
+    region: Rectangle
+    likelihood: ObjectLikelihood
+    directions: Floats
 
 
 class _Joint:
@@ -131,6 +182,7 @@ class _Joint:
         self._poses = poses
         self._settings = settings
         self._layers = [self._layer(i) for i in range(len(models))]
+        self._considered: list[tuple[Considered, ...]] = [()] * len(models)
 
     def polish(self) -> None:
         """Moves one object after the other, the others fixed, until a whole round changes nothing."""
@@ -139,41 +191,116 @@ class _Joint:
             moved = {i for i in sorted(stale) if self._polish(i)}
             stale = {j for i in moved for j in range(len(self._models)) if self._touches(i, j)}
 
+    def settle(self, rgb: NDArray[np.uint8]) -> bool:
+        """Chooses between each object's flips, by depth and then by colour; returns whether any object turned."""
+        turned = [self._settle(i, rgb) for i in range(len(self._models))]
+        return any(turned)
+
     def result(self) -> RefinedScene:
         """The scene as it stands."""
         found = tuple(self._found(i) for i in range(len(self._models)))
         return RefinedScene(found, scene_cost(self._scene, self._layers, self._settings.cost))
 
     def _polish(self, i: int) -> bool:
-        likelihood = self._likelihood(i)
-        directions = self._models[i].proposals.directions(self._scene.T_camera_table)
-        start = self._poses[i][None]
-        moved = likelihood.refine(start, directions, steps=self._settings.steps, gate=self._settings.gate)
-        before, after = likelihood.costs(np.concatenate([start, moved])).tolist()
-        if not after < before - _GAIN * abs(before):
+        place, start = self._place(i), self._poses[i][None]
+        moved = place.likelihood.refine(start, place.directions, steps=self._settings.steps, gate=self._settings.gate)
+        before, after = self._totals(i, place, np.concatenate([start, moved])).tolist()
+        better = after < before - _GAIN * self._visible(i)
+        if better:
+            self._move(i, moved[0])
+        return better
+
+    def _settle(self, i: int, rgb: NDArray[np.uint8]) -> bool:
+        place = self._place(i)
+        poses, totals = self._flips(i, place)
+        equal = self._settings.equal * self._noise(i) * self._visible(i)
+        chosen = np.flatnonzero(totals <= totals.min() + equal)
+        favourite = self._favourite(i, totals[chosen])
+        verdict = self._verdict(i, place, poses[chosen], favourite, rgb) if len(chosen) > 1 else None
+        winner = favourite if verdict is None else verdict.winner
+        self._considered[i] = _considered(poses[chosen], totals[chosen], verdict, winner)
+        if chosen[winner] == 0:
             return False
-        self._poses[i] = moved[0]
-        self._layers[i] = self._layer(i)
+        self._move(i, poses[chosen[winner]])
         return True
 
-    def _likelihood(self, i: int) -> ObjectLikelihood:
+    def _favourite(self, i: int, totals: Floats) -> int:
+        """The pose of least cost; the present one, which comes first, where it is hardly dearer."""
+        best = int(np.argmin(totals))
+        return 0 if totals[0] <= totals[best] + _GAIN * self._visible(i) else best
+
+    def _flips(self, i: int, place: _Place) -> tuple[Floats, Floats]:
+        """The object's pose and those of its flips that fit best once polished, and the scene's cost with each.
+
+        No two are the same modulo the object's symmetries; the present pose comes first.
+        """
+        model, settings = self._models[i], self._settings
+        flips = model.proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
+        rough = place.likelihood.refine(flips, place.directions, steps=3, gate=2 * settings.gate)
+        promising = rough[np.argsort(place.likelihood.costs(rough), kind="stable")[:_PROMISING]]
+        moved = place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
+        poses = np.concatenate([self._poses[i][None], moved])
+        totals = self._totals(i, place, poses)
+        kept = _distinct(poses, totals, model.symmetries)
+        return poses[kept], totals[kept]
+
+    def _verdict(self, i: int, place: _Place, poses: Floats, favourite: int, rgb: NDArray[np.uint8]) -> Verdict | None:
+        if not self._settings.colour:
+            return None
+        x0, y0, x1, y1 = place.region
+        window, model = place.likelihood.window, self._models[i]
+        layers = [inverse_depth(model.shape.soup, pose, window.view) for pose in poses]
+        visible = np.logical_and.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
+        contenders = [Contender(*each) for each in zip(poses, layers, strict=True)]
+        return judge(
+            rgb[y0:y1, x0:x1], window.view, visible, contenders,
+            paint=model.paint, symmetries=model.symmetries, favourite=favourite,
+        )  # fmt: skip
+
+    def _place(self, i: int) -> _Place:
         """Costs of poses of one object about where it is, with all others fixed, at full resolution.
 
         Credit is given everywhere, so that costs differ by as much as the scene's.
         """
         x0, y0, x1, y1 = region = _around(self._models[i].shape, self._poses[i], self._scene)
-        part = np.s_[y0:y1, x0:x1]
         scene = _cropped(self._scene, region)
-        others = [layer[part] for j, layer in enumerate(self._layers) if j != i]
+        others = [layer[y0:y1, x0:x1] for j, layer in enumerate(self._layers) if j != i]
         background = np.maximum.reduce([scene.plane_inverse, *others])
         everything = (0, 0, x1 - x0, y1 - y0)
         window = Window.of(scene, background, everything, everything, stride=1, form=self._settings.cost)
-        return ObjectLikelihood(self._models[i].shape, window, scene, self._settings.cost)
+        directions = self._models[i].proposals.directions(scene.T_camera_table)
+        return _Place(region, ObjectLikelihood(self._models[i].shape, window, scene, self._settings.cost), directions)
+
+    def _totals(self, i: int, place: _Place, poses: Floats) -> Floats:
+        """What the scene costs with the object at each of the poses, up to a constant: depth and contact."""
+        return place.likelihood.costs(poses) + np.array([self._penalty(i, pose) for pose in poses])
+
+    def _penalty(self, i: int, pose: Floats) -> float:
+        if not self._settings.contact:
+            return 0.0
+        solids = [model.solid for model in self._models]
+        poses = np.stack([*self._poses[:i], pose, *self._poses[i + 1 :]])
+        found = contacts(solids, poses, self._scene.T_camera_table)
+        return penalty(found, apparent(solids, poses, self._scene.view.fx))
 
     def _found(self, i: int) -> RefinedObject:
+        cost, visible = self._fit(i)
+        return RefinedObject(self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i])
+
+    def _noise(self, i: int) -> float:
+        return self._fit(i)[0]
+
+    def _visible(self, i: int) -> float:
+        """Pixels that show the object."""
+        return float(self._fit(i)[1] * (self._layers[i] > 0).sum())
+
+    def _fit(self, i: int) -> tuple[float, float]:
         others = [self._scene.plane_inverse, *(layer for j, layer in enumerate(self._layers) if j != i)]
-        cost, visible = fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
-        return RefinedObject(self._models[i].label, self._poses[i], self._layers[i], cost, visible, ())
+        return fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
+
+    def _move(self, i: int, pose: Floats) -> None:
+        self._poses[i] = pose
+        self._layers[i] = self._layer(i)
 
     def _layer(self, i: int) -> Float32s:
         return inverse_depth(self._models[i].shape.soup, self._poses[i], self._scene.view)
@@ -182,6 +309,27 @@ class _Joint:
         """Whether another object stands near enough for its pose to depend on this one's."""
         a, b = (_around(self._models[k].shape, self._poses[k], self._scene) for k in (i, j))
         return i != j and a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _distinct(poses: Floats, totals: Floats, symmetries: Floats) -> list[int]:
+    """The first pose, then the others, cheapest first, without those that equal one before modulo symmetry."""
+    kept = [0]
+    for k in (1 + np.argsort(totals[1:], kind="stable")).tolist():
+        if all(symmetry_angle(poses[j, :, :3], poses[k, :, :3], symmetries) > _SAME for j in kept):
+            kept.append(k)
+    return kept
+
+
+def _considered(poses: Floats, totals: Floats, verdict: Verdict | None, winner: int) -> tuple[Considered, ...]:
+    order = [winner, *(k for k in np.argsort(totals, kind="stable").tolist() if k != winner)]
+    colours = [None] * len(poses) if verdict is None else verdict.distances.tolist()
+    return tuple(Considered(poses[k], float(totals[k] - totals.min()), colours[k]) for k in order)
+
+
+def _shown(window: Window, layer: Float32s, form: CostForm) -> NDArray[np.bool_]:
+    """Where an object at a pose can be seen: nothing known and no reading lies in front of it."""
+    behind = window.factor * (1.0 / np.where(layer > 0, layer, 1.0) - window.observed)
+    return (layer > window.inverse_background) & ~(behind > form.occluder_margin)
 
 
 def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:

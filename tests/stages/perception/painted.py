@@ -1,0 +1,29 @@
+"""Colour images of rendered scenes, without a graphics library."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from stages.perception.colour import surface_normals
+from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.scene.catalogue import Floats, Mesh
+
+LIGHT = np.array([0.3, -0.5, -0.8])
+
+
+def painted(objects: list[tuple[Mesh, Floats]], view: View, *, ambient: float = 0.5, noise: float = 3.0) -> np.ndarray:
+    """H x W x 3 sRGB of meshes at T_camera_object on grey ground, lit from one side, with Gaussian noise."""
+    rng = np.random.default_rng(3)
+    image = np.full((view.height, view.width, 3), 120.0)
+    nearest = np.zeros((view.height, view.width), np.float32)
+    for mesh, T in objects:
+        layer = inverse_depth(Soup.of(mesh), T, view)
+        shown = layer > nearest
+        points = (view.rays()[shown] / layer[shown][:, None] - T[:3, 3]) @ T[:3, :3]
+        colors = mesh.colors[KDTree(mesh.vertices).query(points)[1]]
+        # Gradients of inverse depth point away from the camera.
+        shade = ambient + (1 - ambient) * np.clip(surface_normals(layer, view)[shown] @ -LIGHT, 0, 1)
+        image[shown] = colors * shade[:, None]
+        nearest = np.maximum(nearest, layer)
+    return (image + rng.normal(0, noise, image.shape)).clip(0, 255).astype(np.uint8)
