@@ -3,19 +3,27 @@
 =========================================  ====================================================================
 ``RUN/m/STAGE/PORT``                       every message once (Envelope): for recorder and views
 ``RUN/d/STAGE/REPLICA/PORT``               the same bytes, delivered to one consumer's input port
-``RUN/j/STAGE``                            journal (Step); tells publishers that what it consumed is done with
+``RUN/s/STAGE``                            a step that was done (Step), for the recorder
+``RUN/j/STAGE``                            journal: the recorder's echo of it; what it consumed is done with
+``RUN/gone/STAGE/REPLICA/INCARNATION``     the recorder's word that it has all that a dead process has sent
 ``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
 ``RUN/l/STAGE``                            log lines (LogLine)
 ``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers
 ``RUN/flush``                              query answered by the recorder once it has everything sent before
 =========================================  ====================================================================
 
+Links keep their order, so that a step that the recorder has is there with everything it emitted. A process that is
+killed may have reached some peers and not others: what the recorder has is what counts, for everybody.
+
 A message may be published on its ``m`` key twice, with equal bytes, when its publisher crashed before the step
 was journalled or its part was handed to another replica: readers tell by the id.
 """
 
+from __future__ import annotations
+
 import json
 import os
+import queue
 import socket
 import struct
 import sys
@@ -27,6 +35,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import zenoh
+from zenoh.handlers import Callback
 
 A = TypeVar("A")
 
@@ -34,6 +43,7 @@ BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 FLUSH_SECONDS = 1.0
 RECORDER = "recorder"
+PROCESS_PATH = "{0.stage}/{0.replica}/{0.incarnation}"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -57,13 +67,20 @@ class Packet:
 
 
 class Bus:
-    """One process' connection to the others of its run."""
+    """One process' connection to the others of its run.
+
+    All callbacks run on one thread, in the order in which their causes arrived: Zenoh's own would run each
+    subscription on a thread of its own, and a step could overtake what it emitted.
+    """
 
     def __init__(self, run: str, *, listen: str = "tcp/127.0.0.1:0", connect: str | None = None):
         self._run = run
         self._session = zenoh.open(_config(listen, connect))
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
+        self._caller.start()
 
     def publish(self, path: str, payload: bytes) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run."""
@@ -78,13 +95,13 @@ class Bus:
         publisher.put(payload, attachment=struct.pack("<q", time.monotonic_ns()))
 
     def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
-        """Calls back, on another thread and in order, for everything sent to ``path`` (``*`` and ``**`` allowed)."""
+        """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed)."""
 
-        def receive(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample, arrived_ns: int) -> None:
             key = str(sample.key_expr).removeprefix(f"{self._run}/")
-            callback(Packet(key, sample.payload.to_bytes(), _sent_ns(sample), time.monotonic_ns()))
+            callback(Packet(key, sample.payload.to_bytes(), _sent_ns(sample), arrived_ns))
 
-        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", guarded(receive)))
+        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", self._in_turn(receive)))
 
     def announce(self, process: Process) -> None:
         """Declares this process present, until it closes or dies."""
@@ -94,13 +111,13 @@ class Bus:
     def watch(self, callback: Callable[[Process, bool], None]) -> None:
         """Calls back for every process that is or becomes present (True) and that goes (False)."""
 
-        def receive(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample, _: int) -> None:
             stage, replica, incarnation = str(sample.key_expr).split("/")[-3:]
             present = sample.kind == zenoh.SampleKind.PUT
             callback(Process(stage, int(replica), int(incarnation)), present)
 
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._run}/present/*/*/*", guarded(receive), history=True
+            f"{self._run}/present/*/*/*", self._in_turn(receive), history=True
         )
         self._declared.append(subscriber)
 
@@ -108,10 +125,11 @@ class Bus:
         """Lets the others wait for the recorder: its answer follows everything they sent to it."""
         key = f"{self._run}/flush"
 
-        def answer(query: zenoh.Query) -> None:
-            query.reply(key, b"")
+        def answer(query: zenoh.Query, _: int) -> None:
+            with query:
+                query.reply(key, b"")
 
-        self._declared.append(self._session.declare_queryable(key, guarded(answer)))
+        self._declared.append(self._session.declare_queryable(key, self._in_turn(answer)))
 
     def flush(self) -> bool:
         """Waits until the recorder has received everything sent before; False where it does not answer in time."""
@@ -122,7 +140,29 @@ class Bus:
         """Withdraws everything declared and closes the session."""
         for declared in reversed(self._declared):
             declared.undeclare()
+        self._calls.put(None)
+        if threading.current_thread() is not self._caller:
+            self._caller.join(FLUSH_SECONDS)
         self._session.close()
+
+    def _in_turn(self, receive: Callable[[A, int], None]) -> Callback[A]:
+        """A handler that only queues, so that it may run on the link's own thread; it gets the time of arrival."""
+
+        def enqueue(cause: A) -> None:
+            arrived_ns = time.monotonic_ns()
+            self._calls.put(lambda: receive(cause, arrived_ns))
+
+        return Callback(enqueue, indirect=False)
+
+    def _call_all(self) -> None:
+        """What a callback raises ends the process, with the traceback: it cannot go on half deaf."""
+        try:
+            while (call := self._calls.get()) is not None:
+                call()
+        except Exception:
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
 
 
 class Presence:
@@ -148,20 +188,6 @@ class Presence:
                     return False
                 self._changed.wait(0.1)
         return True
-
-
-def guarded(callback: Callable[[A], None]) -> Callable[[A], None]:
-    """Zenoh swallows what a callback raises; this ends the process with the traceback instead."""
-
-    def call(argument: A) -> None:
-        try:
-            callback(argument)
-        except Exception:
-            traceback.print_exc()
-            sys.stderr.flush()
-            os._exit(1)
-
-    return call
 
 
 def free_endpoint() -> str:

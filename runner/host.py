@@ -55,6 +55,8 @@ class Assignment(msgspec.Struct, frozen=True):
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
     """True where an earlier process has run the start handlers."""
+    consumed: tuple[tuple[str, str], ...] = ()
+    """(port, id) of the newest that earlier processes have consumed: it may be sent again, and is not worked on."""
 
 
 class Host:
@@ -82,6 +84,7 @@ class Host:
         self._deliveries: queue.SimpleQueue[_Delivered | None] = queue.SimpleQueue()
         self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
         """(port, id) of what has arrived, and whether it is consumed."""
+        self._remember(assignment.consumed)
         self._refused = 0
         self._steps = 0
 
@@ -241,7 +244,7 @@ class Host:
         if step.outcome == "done":
             self._remember(step.consumed)
         payload = codec.pack(step)
-        self._delivery.after_arrival(step.emitted, lambda: self._bus.publish(f"j/{self._process.stage}", payload))
+        self._delivery.after_arrival(step.emitted, lambda: self._bus.publish(f"s/{self._process.stage}", payload))
 
     def _say_what_is_left(self) -> None:
         """Records what was never worked on."""

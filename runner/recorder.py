@@ -17,7 +17,7 @@ from typing import IO, Any
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from runner.bus import RECORDER, Bus, Process
+from runner.bus import PROCESS_PATH, RECORDER, Bus, Packet, Process
 from runner.children import die_with_parent
 from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
@@ -218,21 +218,40 @@ class Recorder:
         self._stopping = threading.Event()
         self._bus = Bus(manifest.run, connect=manifest.endpoint)
         self._writer = RecordingWriter(manifest, self._complain)
+        self._echoes: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
+        self._echo = threading.Thread(target=self._echo_all, name="echo", daemon=True)
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
+        self._echo.start()
         self._bus.subscribe("m/**", lambda packet: self._writer.put(Envelope, packet.payload))
-        self._bus.subscribe("j/*", lambda packet: self._writer.put(Step, packet.payload))
+        self._bus.subscribe("s/*", self._on_step)
         self._bus.subscribe("l/*", lambda packet: self._writer.put(LogLine, packet.payload))
+        self._bus.watch(self._on_presence)
         self._bus.answer_flush()
         self._bus.announce(Process(RECORDER, 0))
         self._stopping.wait()
+        self._echoes.put(None)
+        self._echo.join(FLUSH_SECONDS)
         self._bus.close()
         return self._writer.close()
 
     def stop(self) -> None:
         """Ends :meth:`run` after what has arrived. May be called from a signal handler."""
         self._stopping.set()
+
+    def _on_step(self, packet: Packet) -> None:
+        self._writer.put(Step, packet.payload)
+        self._echoes.put((f"j/{packet.key.partition('/')[2]}", packet.payload))
+
+    def _on_presence(self, process: Process, present: bool) -> None:
+        if not present:
+            self._echoes.put((f"gone/{PROCESS_PATH.format(process)}", b""))
+
+    def _echo_all(self) -> None:
+        """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
+        while (echo := self._echoes.get()) is not None:
+            self._bus.publish(*echo)
 
     def _complain(self, text: str) -> None:
         """Shows a line; it comes back over the bus and is recorded too."""

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,8 +31,8 @@ STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
 RECORDER_GRACE_SECONDS = 2.5
 TICK_SECONDS = 0.05
-SETTLE_SECONDS = 0.2
-"""What a dead process has sent is given this long to arrive before its successor is told where to go on."""
+SETTLE_SECONDS = 5.0
+"""How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
 SHOWN_LINES = 8
 EXIT_INCOMPLETE = 3
 
@@ -51,6 +51,7 @@ class _Child:
     handle: subprocess.Popen[bytes]
     log: Path
     started: float = field(default_factory=time.monotonic)
+    announced: bool = False
 
     def reason(self) -> str:
         """Why it ended: the signal, or the last thing it printed."""
@@ -64,12 +65,15 @@ class _Progress:
     """How far a stage has come: what its next process must know."""
 
     numbers: dict[str, int] = field(default_factory=dict[str, int])
+    consumed: deque[tuple[str, str]] = field(default_factory=lambda: deque[tuple[str, str]](maxlen=1000))
     started: bool = False
 
     def note(self, step: Step) -> None:
-        if step.outcome == "done" and not step.consumed:
-            self.started = True
-        for message_id in step.emitted if step.outcome == "done" else ():
+        if step.outcome != "done":
+            return
+        self.started |= not step.consumed
+        self.consumed.extend(step.consumed)
+        for message_id in step.emitted:
             port = message_id.partition("#")[0].rpartition(".")[2]
             self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(message_id) + 1)
 
@@ -95,6 +99,8 @@ class Supervisor:
         self._recorder: _Child | None = None
         self._viewer: _Child | None = None
         self._presence = Presence()
+        self._settled: set[Process] = set()
+        """Dead processes of which the recorder has everything."""
         self._restarts = 0
         self._absent = set(graph.processes())
 
@@ -123,6 +129,7 @@ class Supervisor:
         self._bus.subscribe("j/*", self._on_step)
         self._bus.subscribe("l/*", self._on_log)
         self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
+        self._bus.subscribe("gone/*/*/*", self._on_gone)
         self._bus.watch(self._on_presence)
 
     def _on_step(self, packet: Packet) -> None:
@@ -153,12 +160,17 @@ class Supervisor:
         else:
             self._events.put(End(finished.code, finished.reason))
 
+    def _on_gone(self, packet: Packet) -> None:
+        _, stage, replica, incarnation = packet.key.split("/")
+        self._settled.add(Process(stage, int(replica), int(incarnation)))
+
     def _on_presence(self, process: Process, present: bool) -> None:
         self._delivery.update(process, present)
         self._presence.update(process, present)
         child = self._children.get((process.stage, process.replica))
         if not present or child is None:
             return
+        child.announced = True
         seconds = time.monotonic() - child.started
         self._terminal.show(self._name_of(process.stage, process.replica), f"ready after {seconds:.1f} s")
         self._absent.discard((process.stage, process.replica))
@@ -192,6 +204,7 @@ class Supervisor:
             incarnation=process.incarnation,
             numbers=progress.numbers,
             started=progress.started,
+            consumed=tuple(progress.consumed),
         )
         return self._spawn(process, "runner.host", msgspec.json.encode(task))
 
@@ -241,10 +254,18 @@ class Supervisor:
         if child.handle.returncode < 0:
             self._show_output(child)
         self._publish_restart(process, child.reason())
-        time.sleep(SETTLE_SECONDS)
+        self._settle(child)
         successor = Process(process.stage, process.replica, process.incarnation + 1)
         self._children[process.stage, process.replica] = self._start(successor)
         return None
+
+    def _settle(self, child: _Child) -> None:
+        """Waits until all that the recorder has of a dead process is known here."""
+        deadline = time.monotonic() + SETTLE_SECONDS
+        while child.announced and child.process not in self._settled and time.monotonic() < deadline:
+            if self._recorder_died():
+                return
+            time.sleep(TICK_SECONDS / 5)
 
     def _publish_restart(self, process: Process, reason: str) -> None:
         message = Restarted(stage=process.stage, replica=process.replica, reason=reason)

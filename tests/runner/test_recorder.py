@@ -51,7 +51,7 @@ class Session:
 
     def journal(self, number: int, *emitted: str) -> None:
         step = Step("camera", 0, 0, number, "source", (), emitted, number, 0, 0, 0)
-        self.bus.publish("j/camera", pack(step))
+        self.bus.publish("s/camera", pack(step))
 
     def stop(self) -> int:
         assert self.bus.flush()
@@ -109,7 +109,7 @@ def test_a_corrupt_message_is_refused_in_one_line_and_the_recorder_lives_on(tmp_
     session = Session(tmp_path)
     session.wait()
     session.bus.publish("m/camera/picture", b"\xff\x00 nonsense")
-    session.bus.publish("j/camera", b"")
+    session.bus.publish("s/camera", b"")
     session.send(0, pictures[0])
     session.bus.publish("l/camera", pack(LogLine("camera", 0, "info", "done", 0)))
     time.sleep(1)

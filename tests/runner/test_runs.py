@@ -126,8 +126,9 @@ def test_a_killed_replica_changes_no_byte(plain: Run, tmp_path: Path):
     assert all(bodies[e.id] == bytes(e.body) for e in Recording(plain.recording).envelopes())
 
 
-def test_a_killed_stage_goes_on_where_it_was(tmp_path: Path):
-    killed = run(DOUBLES, tmp_path, "doubler.die_at=2")
+@pytest.mark.parametrize("die_at", [0, 2, 4])
+def test_a_killed_stage_goes_on_where_it_was(tmp_path: Path, die_at: int):
+    killed = run(DOUBLES, tmp_path, f"doubler.die_at={die_at}")
     assert (killed.code, killed.result) == (0, ["0", "2", "4", "6", "8"]), killed.output
 
 
