@@ -23,6 +23,7 @@ from runner.drawing import (
     Graph,
     Image,
     Layout,
+    Lines3D,
     Mesh3D,
     NextStep,
     Panel,
@@ -40,6 +41,7 @@ from stages.messages import (
     Frame,
     Goal,
     LookRequest,
+    ObjectPose,
     Observation,
     Outcome,
     Plan,
@@ -53,6 +55,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.digest import ParticleTrace
+from stages.messages.scene import UnknownRegion
 from stages.perception.camera_model import back_project
 from stages.perception.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue, Floats, Mesh
@@ -65,10 +68,16 @@ TABLE_SIZE = (0.7, 1.1)
 """Metres of support plane drawn around the objects, along x and y of the base."""
 NODE_SPACING = (130.0, 110.0)
 """Pixels between the nodes of a scene graph, across and down."""
+GHOST_TRIANGLES = 80
+SURE, UNSURE = 0.9, 0.5
+"""Probabilities from which an object is drawn as sure and below which as unsure."""
 _GREY: Color = (128, 128, 128)
 _BLUE: Color = (86, 156, 214)
 _GREEN: Color = (106, 190, 120)
 _ORANGE: Color = (230, 150, 70)
+_RED: Color = (226, 82, 74)
+_MAGENTA: Color = (214, 92, 200)
+_GHOST: Color = (205, 210, 225)
 
 
 class Views:
@@ -101,7 +110,7 @@ class Views:
         filters = Row(
             (
                 Panel("Best cost over iterations", "series", "cost"),
-                Tabs((Panel("Hypotheses' weights", "bars", "weights"), Panel("Look", "text", "look"))),
+                Tabs((Panel("Hypotheses: probability", "bars", "weights"), Panel("Look", "text", "look"))),
             )
         )
         world = Column(
@@ -162,6 +171,8 @@ class Views:
             del self._frames[key]
         yield Clear("camera/candidates")
         yield Clear("world/camera/particles")
+        yield Clear("world/camera/doubt")
+        yield Clear("estimate/objects")
         yield Clear("cost")
         yield Image("camera/rgb", frame.rgb)
         yield DepthImage("depth/image", frame.depth)
@@ -171,15 +182,21 @@ class Views:
             yield Pinhole("world/camera/frustum", frame.K, width, height)
 
     def _estimate(self, estimate: SceneEstimate) -> Iterator[Drawing]:
+        """The ranker's estimate ends the animation of the particles; the refiner's, with its doubt, replaces it."""
         yield Transform("world/camera", base_from_camera(estimate))
         winner = next((item for item in self._posteriors if _same_objects(item, estimate)), None)
-        if winner is not None:
+        if winner is not None and estimate.probabilities is None:
             yield from particle_frames(winner, self._colors)
-        yield BarChart("weights/hypotheses", estimate.log_weights - estimate.log_weights.min(), _BLUE)
+        weights = estimate.log_weights - estimate.log_weights.min()
+        yield BarChart(
+            "weights/hypotheses", weights if estimate.probabilities is None else estimate.probabilities, _BLUE
+        )
         yield Text("look", look_text(estimate))
-        frame = self._frames.pop((estimate.scene_id, estimate.image_id, estimate.name), None)
+        yield from doubt_drawings(estimate, self._catalogue)
+        frame = self._frames.get((estimate.scene_id, estimate.image_id, estimate.name))
         if frame is not None:
             yield Image("estimate/rgb", self._overlay(frame, estimate))
+            yield doubt_boxes(estimate)
 
     def _overlay(self, frame: Frame, estimate: SceneEstimate) -> np.ndarray[Any, np.dtype[np.uint8]]:
         """The observation in grey with the estimated objects, rendered, laid over it."""
@@ -271,13 +288,85 @@ def _particles(trace: ParticleTrace, iteration: int) -> Floats:
 
 
 def look_text(estimate: SceneEstimate) -> str:
-    """The winning hypothesis in words."""
-    title = f"### Hypothesis {estimate.winner} of {len(estimate.log_weights)} wins"
-    left_out = f"\n{estimate.left_out} combinations were left out by the cap." if estimate.left_out else ""
-    rows = [
-        f"| {item.name} | {item.confidence:.2f} | {item.cost:.1f} | {item.visible:.0%} |" for item in estimate.objects
+    """The winning hypothesis in words, and how sure it is."""
+    sure = "" if estimate.probabilities is None else f", probability {estimate.probabilities[estimate.winner]:.2f}"
+    title = f"### Hypothesis {estimate.winner + 1} of {len(estimate.log_weights)} wins{sure}"
+    notes = [f"{estimate.left_out} combinations were left out by the cap."] if estimate.left_out else []
+    notes += [f"Something unknown: {_size(item)}, {item.points} readings." for item in estimate.unknown]
+    header = ["| object | sure | spread | fit | visible | |", "|---|---|---|---|---|---|"]
+    return "\n".join([title, *(f"\n{note}" for note in notes), "", *header, *map(_look_row, estimate.objects)])
+
+
+def _look_row(item: ObjectPose) -> str:
+    sure = "" if item.probability is None else f"{item.probability:.2f}"
+    notes = ["**contradicted**"] if item.contradicted else []
+    notes += [f"or another pose ({other.probability:.2f})" for other in item.alternatives[:1]]
+    cells = (item.name, sure, _spread(item), f"{1e3 * item.cost:.1f} mm", f"{item.visible:.0%}", ", ".join(notes))
+    return f"| {' | '.join(cells)} |"
+
+
+def _spread(item: ObjectPose) -> str:
+    return (
+        "" if item.probability is None else f"{1e3 * item.spread_metres:.0f} mm {np.rad2deg(item.spread_radians):.0f}°"
+    )
+
+
+def _size(region: UnknownRegion) -> str:
+    return " x ".join(f"{100 * edge:.0f}" for edge in region.extent_table) + " cm"
+
+
+def doubt_boxes(estimate: SceneEstimate) -> Boxes2D:
+    """Every object over the estimate with its probability and spread, and what no object explains."""
+    judged = [item for item in estimate.objects if item.probability is not None]
+    labels = [
+        f"{item.name} {'CONTRADICTED' if item.contradicted else f'{item.probability:.2f}  {_spread(item)}'}"
+        for item in judged
     ]
-    return "\n".join([title, left_out, "| object | confidence | cost | visible |", "|---|---|---|---|", *rows])
+    return Boxes2D(
+        "estimate/objects",
+        np.array([item.box for item in (*judged, *estimate.unknown)]).reshape(-1, 4),
+        labels=(*labels, *("unknown" for _ in estimate.unknown)),
+        colors=(*map(_certainty, judged), *(_MAGENTA for _ in estimate.unknown)),
+    )
+
+
+def _certainty(item: ObjectPose) -> Color:
+    """Green where the pose can be relied on, red where it cannot."""
+    probability = item.probability or 0.0
+    if item.contradicted or probability < UNSURE:
+        return _RED
+    return _GREEN if probability >= SURE else _ORANGE
+
+
+def doubt_drawings(estimate: SceneEstimate, catalogue: Catalogue) -> Iterator[Drawing]:
+    """In space: other poses an object may have, as ghosts of its edges; what is contradicted or unknown, boxed."""
+    for item in estimate.objects:
+        mesh = catalogue[item.label].simplified(GHOST_TRIANGLES)
+        for number, other in enumerate(item.alternatives):
+            strips = _edges(mesh, other.T_camera_object)
+            yield Lines3D(f"world/camera/doubt/{item.name}_{number}", strips, _GHOST, radius=0.0006)
+        if item.contradicted:
+            low, high = catalogue[item.label].bounds
+            box = _box_edges(low, high, item.T_camera_object)
+            yield Lines3D(f"world/camera/doubt/{item.name}_contradicted", box, _RED)
+    for number, region in enumerate(estimate.unknown):
+        low, high = (region.centre_table + sign * region.extent_table / 2 for sign in (-1, 1))
+        yield Lines3D(f"world/camera/doubt/unknown_{number}", _box_edges(low, high, estimate.T_camera_table), _MAGENTA)
+
+
+def _edges(mesh: Mesh, T: Floats) -> tuple[Floats, ...]:
+    """The outline of every triangle, moved."""
+    vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    return tuple(vertices[[a, b, c, a]] for a, b, c in mesh.faces.tolist())
+
+
+def _box_edges(low: Floats, high: Floats, T: Floats) -> tuple[Floats, ...]:
+    """The twelve edges of a box as four open strips, moved by ``T``."""
+    (x0, y0, z0), (x1, y1, z1) = low.tolist(), high.tolist()
+    ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    strips = [[(*ring[k], z1), (*ring[k], z0), (*ring[(k + 1) % 4], z0)] for k in range(4)]
+    strips.append([(*corner, z1) for corner in (*ring, ring[0])])
+    return tuple(np.array(strip) @ T[:3, :3].T + T[:3, 3] for strip in strips)
 
 
 def table_plane(scene: SceneGraph) -> Mesh3D:

@@ -20,8 +20,10 @@ _MARGIN = 0.012
 as the noise of triangulation does."""
 _EDGE = 5
 """Pixels about a silhouette (at 640 pixels across) in which a reading may belong to either side."""
-_HEIGHT = 0.012
-"""Metres above the plane below which a reading may be the plane's own."""
+_HEIGHT = 0.015
+"""Metres above the plane, at one metre, below which a reading may be the plane's own; grows likewise."""
+_TOP = 0.025
+"""Metres above the plane that a region reaches at least: a sensor's bias bends the plane it sees."""
 _AREA = 4e-4
 """Square metres facing the camera that a region has at least: 2 cm by 2 cm."""
 _POINTS = 40
@@ -79,7 +81,7 @@ def is_contradicted(share: float) -> bool:
 def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
     """Readings above the plane away from every surface and every silhouette."""
     normal, offset = scene.plane[:3], scene.plane[3]
-    above = ((scene.view.rays() * normal).sum(-1) * scene.depth + offset) > _HEIGHT
+    above = ((scene.view.rays() * normal).sum(-1) * scene.depth + offset) > _HEIGHT * _growth(scene)
     open_readings = scene.foreground & above
     margin = _margin(scene)
     for layer in layers:
@@ -97,11 +99,18 @@ def _region(scene: ObservedScene, mask: Mask, points_table: Floats) -> Region | 
         return None
     box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
     low, high = np.percentile(points_table[rows, columns], [2, 98], axis=0)
+    if high[2] < _TOP:
+        return None
     return Region(box, len(rows), (low + high) / 2, high - low)
 
 
 def _margin(scene: ObservedScene) -> Floats:
-    return _MARGIN * np.maximum(scene.depth.astype(np.float64), 1.0) ** 2
+    return _MARGIN * _growth(scene)
+
+
+def _growth(scene: ObservedScene) -> Floats:
+    """How much larger a sensor's errors are than at one metre or less, H x W."""
+    return np.maximum(scene.depth.astype(np.float64), 1.0) ** 2
 
 
 def _edge(scene: ObservedScene) -> int:

@@ -17,6 +17,7 @@ from runner.drawing import (
     Graph,
     Image,
     Layout,
+    Lines3D,
     Mesh3D,
     NextStep,
     Panel,
@@ -45,9 +46,19 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.digest import ParticleTrace
+from stages.messages.scene import Alternative, UnknownRegion
 from stages.perception.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue
-from stages.views import Views, node_places, observation_points, palette, progress_line, scene_nodes, table_plane
+from stages.views import (
+    Views,
+    doubt_drawings,
+    node_places,
+    observation_points,
+    palette,
+    progress_line,
+    scene_nodes,
+    table_plane,
+)
 from tests.stages.episodes import CATALOGUE, K, outcome, plan, scene, transfer, translation
 
 CATALOGUE_DATA = Catalogue.load(Path(CATALOGUE))
@@ -241,6 +252,52 @@ def test_an_estimate_of_another_image_is_drawn_without_its_frame() -> None:
     views = Views({"camera": {"catalogue": CATALOGUE}})
     drawings = list(views.draw(estimate()))
     assert not paths_of(drawings, Image) and paths_of(drawings, BarChart)
+
+
+def doubtful() -> SceneEstimate:
+    """An estimate that may be turned round, that the image contradicts, beside something unknown."""
+    other = Alternative(T_camera_object=T_CAMERA_CUP @ np.diag([-1.0, -1, 1, 1]), probability=0.25)
+    item = msgspec.structs.replace(
+        cup(), probability=0.7, spread_metres=0.004, spread_radians=0.2, alternatives=(other,), contradicted=True
+    )
+    region = UnknownRegion(
+        box=np.array([10.0, 20, 50, 60]),
+        points=900,
+        centre_table=np.array([0.1, 0.2, 0.05]),
+        extent_table=np.array([0.04, 0.06, 0.1]),
+    )
+    return msgspec.structs.replace(
+        estimate(), objects=(item,), probabilities=np.array([0.8, 0.2]), unknown=(region,), log_weights=np.zeros(2)
+    )
+
+
+def test_doubt_is_drawn() -> None:
+    views = Views({"camera": {"catalogue": CATALOGUE}})
+    list(views.draw(frame()))
+    list(views.draw(estimate()))
+    drawings = list(views.draw(doubtful()))
+    (bars,) = [item for item in drawings if isinstance(item, BarChart)]
+    assert bars.values.tolist() == [0.8, 0.2]
+    assert paths_of(drawings, Image) == ["estimate/rgb"]
+    (boxes,) = [item for item in drawings if isinstance(item, Boxes2D)]
+    assert boxes.labels == ("cup CONTRADICTED", "unknown") and len(boxes.boxes) == len(boxes.colors) == 2
+    (page,) = [item for item in drawings if isinstance(item, Text)]
+    assert "probability 0.80" in page.markdown and "| cup | 0.70 | 4 mm 11° |" in page.markdown
+    assert "or another pose (0.25)" in page.markdown and "4 x 6 x 10 cm, 900 readings" in page.markdown
+
+
+def test_ghosts_and_boxes_stand_where_they_belong() -> None:
+    lines = {
+        item.path: np.concatenate(item.strips)
+        for item in doubt_drawings(doubtful(), CATALOGUE_DATA)
+        if isinstance(item, Lines3D)
+    }
+    unknown = lines["world/camera/doubt/unknown_0"]
+    assert unknown.min(0) == pytest.approx([0.08, 0.17, 0.0]) and unknown.max(0) == pytest.approx([0.12, 0.23, 0.1])
+    for path in ("world/camera/doubt/cup_0", "world/camera/doubt/cup_contradicted"):
+        local = (lines[path] - T_CAMERA_CUP[:3, 3]) @ T_CAMERA_CUP[:3, :3]
+        low, high = CATALOGUE_DATA["cup"].bounds
+        assert (local > low - 0.003).all() and (local < high + 0.003).all()
 
 
 def test_progress_tells_the_story(drawn: dict[str, list[Drawing]]) -> None:
