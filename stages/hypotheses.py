@@ -4,57 +4,121 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 from runner.contract import Context, Refused, Stage
-from stages.messages import Candidates, Frame, Hypothesis, Observation
-from stages.perception.combinations import count_combinations, most_confident
+from stages.messages import Candidate, Candidates, Frame, Hypothesis, Observation
+from stages.messages.digest import Glimpse, Placed, Prospect, Sighting, Start
+from stages.perception.combinations import cheapest, count_combinations, count_subsets, most_confident, ordered
+from stages.perception.composition import FirstLook
+from stages.perception.likelihood import CostForm
 from stages.perception.preprocessing import preprocess
+
+OBJECT_COST = 0.1
+"""With N_c unknown an object must explain a tenth of what it would if all of its silhouette were in sight and nothing
+else explained it."""
 
 
 class Hypotheses(Stage):
-    """Equation 2: h = C(m, N_c) hypotheses where N_c <= m, one of all m candidates otherwise."""
+    """Equation 2: h = C(m, N_c) hypotheses where N_c <= m, one of all m candidates otherwise.
+
+    Each candidate is looked at alone first, once for all hypotheses, and those go on whose objects together would cost
+    least as they stand. The paper's plain form takes no such look; the most confident combinations go on.
+    """
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
         """Settings."""
 
-        n_objects: int | None = None
-        """N_c; None takes the number that comes with each frame (a data set's targets)."""
+        n_objects: int | Literal["auto"] | None = None
+        """N_c; ``auto`` finds it; None takes the number that comes with each frame (a data set's targets)."""
         max_hypotheses: int = 32
-        """Cap on h, highest joint confidence first."""
+        """Cap on h without first looks, highest joint confidence first."""
+        finalists: int = 8
+        """Cap on h with first looks, least cost first."""
         max_height: float = 0.6
         """Metres above the support plane beyond which a reading belongs to no object."""
 
         def __post_init__(self) -> None:
-            if self.n_objects is not None and self.n_objects < 0:
-                raise Refused(f"hypotheses.n_objects is {self.n_objects}; it must be 0 or more, or absent")
-            if self.max_hypotheses < 1:
-                raise Refused(f"hypotheses.max_hypotheses is {self.max_hypotheses}; it must be 1 or more")
+            if self.n_objects is not None and self.n_objects != "auto" and self.n_objects < 0:
+                raise Refused(f"hypotheses.n_objects is {self.n_objects}; it must be 0 or more, auto, or absent")
+            for name in ("max_hypotheses", "finalists"):
+                if getattr(self, name) < 1:
+                    raise Refused(f"hypotheses.{name} is {getattr(self, name)}; it must be 1 or more")
             if self.max_height <= 0:
                 raise Refused(f"hypotheses.max_height is {self.max_height} m; it must be above 0")
 
     def __init__(self, config: Config) -> None:
         self.config = config
 
-    def on_candidates(self, frame: Frame, candidates: Candidates, ctx: Context) -> Iterator[Observation | Hypothesis]:
-        """One observation, then h hypotheses, the most confident combination first."""
+    def on_candidates(self, frame: Frame, candidates: Candidates, ctx: Context) -> Iterator[Observation | Prospect]:
+        """One observation, then every candidate by itself, the most confident first."""
+        number = self._n_objects(frame)
         yield preprocess(frame, candidates.candidates, ctx.rng, max_height=self.config.max_height)
-        chosen = self._n_objects(frame)
-        combinations = most_confident(candidates.candidates, chosen, self.config.max_hypotheses)
-        left_out = count_combinations(len(candidates.candidates), chosen) - len(combinations)
-        if left_out:
-            ctx.log(
-                f"{frame.name}: {len(combinations)} of {len(combinations) + left_out} hypotheses, {left_out} of the "
-                "least confident left out (hypotheses.max_hypotheses)"
+        prospects = ordered(candidates.candidates) or [None]
+        for index, candidate in enumerate(prospects):
+            yield Prospect(index=index, count=len(prospects), candidate=candidate, n_objects=number)
+
+    def on_sightings(self, sightings: list[Sighting], detected: Candidates, ctx: Context) -> Iterator[Hypothesis]:
+        """h hypotheses, the cheapest (in the paper's plain form the most confident) combination first."""
+        candidates = ordered(detected.candidates)
+        glimpses = [sighting.glimpse for sighting in sightings if sighting.glimpse is not None]
+        starts = [sighting.start for sighting in sightings if sighting.start is not None]
+        number = sightings[0].n_objects
+        if len(starts) < len(candidates) or not candidates:
+            yield from self._most_confident(candidates, number, ctx)
+        else:
+            yield from self._cheapest(candidates, starts, glimpses, number, ctx)
+
+    def _most_confident(self, candidates: list[Candidate], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
+        if number is None and candidates:
+            raise Refused(
+                "hypotheses.n_objects is auto, which particle_filter.form paper cannot do; set a whole number"
             )
+        number = number or 0
+        combinations = most_confident(candidates, number, self.config.max_hypotheses)
+        left_out = count_combinations(len(candidates), number) - len(combinations)
+        if left_out:
+            ctx.log(_left_out(len(combinations), left_out, "least confident", "max_hypotheses"))
         for index, combination in enumerate(combinations):
             yield Hypothesis(index=index, count=len(combinations), candidates=combination, left_out=left_out)
 
-    def _n_objects(self, frame: Frame) -> int:
+    def _cheapest(
+        self, candidates: list[Candidate], starts: list[Start], glimpses: list[Glimpse], number: int | None,
+        ctx: Context,
+    ) -> Iterator[Hypothesis]:  # fmt: skip
+        object_cost = 0.0 if number is not None else OBJECT_COST
+        look = FirstLook(glimpses, object_cost=object_cost, truncation=CostForm().truncation)
+        combinations = cheapest(look.cost, len(candidates), number, self.config.finalists)
+        left_out = count_subsets(len(candidates), number) - len(combinations)
+        if left_out:
+            ctx.log(_left_out(len(combinations), left_out, "dearest at first look", "finalists"))
+        incumbent = tuple(
+            Placed(candidate=candidates[i], T_camera_object=starts[i].T_camera_object) for i in combinations[0]
+        )
+        for index, chosen in enumerate(combinations):
+            yield Hypothesis(
+                index=index,
+                count=len(combinations),
+                candidates=tuple(candidates[i] for i in chosen),
+                left_out=left_out,
+                starts=tuple(starts[i] for i in chosen),
+                incumbent=incumbent,
+                object_cost=object_cost,
+            )
+
+    def _n_objects(self, frame: Frame) -> int | None:
+        """N_c, or None where it is to be found."""
+        if self.config.n_objects == "auto":
+            return None
         for number in (self.config.n_objects, frame.n_objects):
             if number is not None:
                 return number
         raise Refused(
-            f"{frame.name}: the number of objects is not known; set hypotheses.n_objects to a whole number, or use a "
-            "data set with a targets file"
+            f"{frame.name}: the number of objects is not known; set hypotheses.n_objects to a whole number or auto, or "
+            "use a data set with a targets file"
         )
+
+
+def _left_out(kept: int, left_out: int, which: str, setting: str) -> str:
+    return f"{kept} of {kept + left_out} hypotheses, {left_out} of the {which} left out (hypotheses.{setting})"

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
-from stages.messages.digest import ParticleTrace
+from stages.messages.digest import ParticleTrace, Placed, Prospect, Sighting, Start
 from stages.perception.evaluators import DEVICES, chosen_device
 from stages.perception.likelihood import ObservedScene
 from stages.perception.particle_filter import FilterSettings, Track
 from stages.perception.poses import pose
-from stages.perception.scene_filter import Found, SceneFilter, Suspect
-from stages.scene.catalogue import Catalogue
+from stages.perception.scene_filter import Found, SceneFilter, SceneResult, Suspect
+from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.naming import unique_names
 
 
@@ -67,29 +69,67 @@ class ParticleFilter(Stage):
         self._filter = SceneFilter(Catalogue.load(Path(config.catalogue)), settings, seed=config.seed)
         self._filter.warm_up()
 
+    def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
+        """A look at one candidate alone, where the form takes one."""
+        candidate = prospect.candidate
+        nothing = Sighting(index=prospect.index, count=prospect.count, n_objects=prospect.n_objects)
+        if candidate is None or not self._filter.looks_first:
+            return nothing
+        scene, suspect = _scene(view), _suspect(candidate)
+        track = self._filter.look(scene, suspect, among=prospect.count)
+        start = Start(T_camera_object=_pose(track), trace=_trace(track))
+        return msgspec.structs.replace(nothing, start=start, glimpse=self._filter.glimpse(scene, suspect, track))
+
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
         """The most likely scene of the hypothesis and its unnormalised weight."""
-        scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
-        candidates = hypothesis.candidates
-        result = self._filter.estimate(scene, [Suspect(c.label, c.box) for c in candidates])
-        names = unique_names([candidate.label for candidate in candidates])
-        ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f}")
+        scene = _scene(observation)
+        suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
+        starts = [_track(start) for start in hypothesis.starts]
+        reached = self._reached(scene, hypothesis.incumbent)
+        result = self._filter.estimate(scene, suspects, starts, reached=reached)
+        names = unique_names([candidate.label for candidate in hypothesis.candidates])
+        remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
+        ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
+        objects = zip(names, hypothesis.candidates, result.objects, strict=True)
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
-            objects=tuple(_object(*each) for each in zip(names, candidates, result.objects, strict=True)),
-            log_weight=-self.config.lambda_r * result.cost,
+            objects=tuple(_object(*each) for each in objects),
+            log_weight=-self.config.lambda_r * (result.cost + self._charge(scene, suspects, result, hypothesis)),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
+            dropped=result.dropped,
         )
+
+    def _reached(self, scene: ObservedScene, incumbent: Sequence[Placed]) -> float:
+        """What the known scene costs; infinite where there is none."""
+        if not incumbent:
+            return np.inf
+        suspects = [_suspect(placed.candidate) for placed in incumbent]
+        return self._filter.begun_cost(scene, suspects, [placed.T_camera_object[:3] for placed in incumbent])
+
+    def _charge(
+        self, scene: ObservedScene, suspects: Sequence[Suspect], result: SceneResult, hypothesis: Hypothesis
+    ) -> float:
+        if not hypothesis.object_cost:
+            return 0.0
+        poses = [found.track.T_camera_object for found in result.objects]
+        return hypothesis.object_cost * self._filter.charge(scene, suspects, poses)
+
+
+def _scene(observation: Observation) -> ObservedScene:
+    return ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+
+
+def _suspect(candidate: Candidate) -> Suspect:
+    return Suspect(candidate.label, candidate.box)
 
 
 def _object(name: str, candidate: Candidate, found: Found) -> ObjectPose:
-    T = found.track.T_camera_object
     return ObjectPose(
         name=name,
         label=candidate.label,
-        T_camera_object=pose(T[:, :3], T[:, 3]),
+        T_camera_object=_pose(found.track),
         confidence=candidate.confidence,
         cost=found.cost,
         box=candidate.box,
@@ -97,5 +137,15 @@ def _object(name: str, candidate: Candidate, found: Found) -> ObjectPose:
     )
 
 
+def _pose(track: Track) -> Floats:
+    T = track.T_camera_object
+    return pose(T[:, :3], T[:, 3])
+
+
 def _trace(track: Track) -> ParticleTrace:
     return ParticleTrace(iterations=track.iterations, costs=np.array(track.costs, float), positions=track.positions)
+
+
+def _track(start: Start) -> Track:
+    trace = start.trace
+    return Track(start.T_camera_object[:3].copy(), np.inf, trace.iterations, tuple(trace.costs), trace.positions)

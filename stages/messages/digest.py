@@ -37,14 +37,6 @@ class Observation(Message, frozen=True, kw_only=True):
     name: str = ""
 
 
-class Hypothesis(Part, frozen=True, kw_only=True):
-    """H_i: one combination of N_c candidates, most confident first (equation 2)."""
-
-    candidates: tuple[Candidate, ...]
-    left_out: int = 0
-    """Combinations of the frame that the cap left out."""
-
-
 class ParticleTrace(Struct, frozen=True, kw_only=True):
     """How the filter of one object converged, thinned for people to look at."""
 
@@ -53,6 +45,64 @@ class ParticleTrace(Struct, frozen=True, kw_only=True):
     """Best cost per kept iteration."""
     positions: Matrix
     """Particle positions of the kept iterations in the camera frame, one row ``[iteration, x, y, z]`` each."""
+
+
+class Prospect(Part, frozen=True, kw_only=True):
+    """C_i by itself: to be looked at alone, once for all hypotheses that it is part of."""
+
+    candidate: Candidate | None
+    """None in the one part of a frame without candidates."""
+    n_objects: int | None
+    """N_c of the frame; None where it is not known."""
+
+
+class Start(Struct, frozen=True, kw_only=True):
+    """Where a candidate's object stands if it is the only one on the table."""
+
+    T_camera_object: Pose
+    trace: ParticleTrace
+
+
+class Glimpse(Struct, frozen=True, kw_only=True):
+    """What a candidate's object shows at its start: every second pixel of the rectangle about it."""
+
+    left: int
+    top: int
+    """First column and row, in kept pixels."""
+    inverse: Depth
+    """Inverse depth of the object, 1/metres; 0 beside it."""
+    change: Depth
+    """What the cost of the scene changes by where the object is in sight, metres."""
+
+
+class Sighting(Part, frozen=True, kw_only=True):
+    """What the look at one candidate alone found; nothing in the paper's plain form, which takes none."""
+
+    n_objects: int | None
+    start: Start | None = None
+    glimpse: Glimpse | None = None
+
+
+class Placed(Struct, frozen=True, kw_only=True):
+    """A candidate's object at a pose."""
+
+    candidate: Candidate
+    T_camera_object: Pose
+
+
+class Hypothesis(Part, frozen=True, kw_only=True):
+    """H_i: one combination of N_c candidates, most confident first (equation 2)."""
+
+    candidates: tuple[Candidate, ...]
+    left_out: int = 0
+    """Combinations of the frame that the cap left out."""
+    starts: tuple[Start, ...] = ()
+    """Of each candidate, where there were looks at each alone."""
+    incumbent: tuple[Placed, ...] = ()
+    """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
+    object_cost: float = 0.0
+    """What every object adds to the cost of the scene: this share of what the readings on its silhouette would cost,
+    were none of them explained; 0 where the number of objects is known."""
 
 
 class Posterior(Part, frozen=True, kw_only=True):
@@ -64,6 +114,8 @@ class Posterior(Part, frozen=True, kw_only=True):
     traces: tuple[ParticleTrace, ...] = ()
     left_out: int = 0
     """Combinations of the frame that the cap left out."""
+    dropped: bool = False
+    """The hypothesis cannot win: ``log_weight`` is an upper bound, the objects stand where they start."""
 
 
 class SceneEstimate(Message, frozen=True, kw_only=True):

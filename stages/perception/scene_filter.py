@@ -9,13 +9,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.perception.likelihood import CostForm, ObservedScene, credits, with_object
+from stages.messages.digest import Glimpse
+from stages.perception.composition import Composition, glimpse, scene_cost, silhouette
+from stages.perception.likelihood import CostForm, ObservedScene, with_object
 from stages.perception.particle_filter import FilterSettings, ObjectFilter, Track, pixels
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, Floats
 
 _IDLE = 0.01
 """An object explains nothing if it lowers the cost of the scene by a smaller share."""
+_LEFT = 0.2
+"""An object that explains nothing is looked for again if more than this share of its box is unexplained."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +49,19 @@ class SceneResult:
     objects: tuple[Found, ...]
     cost: float
     """d(R, O) of equation 9 over the whole image, metres times pixels at full resolution."""
+    dropped: bool = False
+    """The hypothesis cannot win: ``cost`` is a lower bound of what its scenes cost, and the objects stand where the
+    first look saw them."""
 
 
 class SceneFilter:
-    """The sequential filter over the objects of a hypothesis.
+    """Estimates the objects of hypothesised scenes.
 
-    Seeds come from the observation and the candidates up to the object, so two hypotheses that begin alike share
-    those objects' estimates; the last ``memory`` of these are remembered, which saves time and changes no byte.
+    Where objects are visited again once all are known, each candidate is looked at alone first. That look depends on
+    the observation and the candidate only, so all hypotheses share it; what follows is particular to the hypothesis.
+    The paper's plain form estimates one object after the other instead, those before it fixed; there seeds come from
+    the candidates up to the object, so hypotheses that begin alike share those objects' estimates. The last ``memory``
+    tracks are remembered either way, which saves time and changes no byte.
     """
 
     def __init__(self, catalogue: Catalogue, settings: FilterSettings, *, seed: int = 0, memory: int = 256) -> None:
@@ -61,6 +71,12 @@ class SceneFilter:
         self._memory = memory
         self._filters: dict[str, ObjectFilter] = {}
         self._tracks: OrderedDict[bytes, Track] = OrderedDict()
+        self._costs: OrderedDict[bytes, float] = OrderedDict()
+
+    @property
+    def looks_first(self) -> bool:
+        """Whether hypotheses begin with looks at each candidate alone; the paper's plain form knows none."""
+        return self._settings.sweeps > 0
 
     def warm_up(self) -> None:
         """Lays out every object and compiles the kernels (or loads them), so that the first image waits for nothing."""
@@ -75,19 +91,52 @@ class SceneFilter:
         suspect = Suspect(next(iter(self._catalogue.objects)), np.array([4.0, 3.0, 12.0, 9.0]))
         SceneFilter(self._catalogue, replace(self._settings, iterations=2, sweeps=0)).estimate(scene, [suspect])
 
-    def estimate(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> SceneResult:
-        """Estimates the suspects in the order given, earlier ones fixed, then visits again what has changed."""
-        tracks = self._sequence(scene, suspects)
-        layers = [self._layer(scene, s, t) for s, t in zip(suspects, tracks, strict=True)]
-        self._rescue(scene, suspects, tracks, layers)
-        stale = {
-            i
-            for i, found in enumerate(self._found(scene, tracks, layers))
-            if found.cost > self._settings.poor or self._seen_by(scene, suspects[i], layers[i + 1 :])
-        }
-        for sweep in range(self._settings.sweeps):
-            stale = self._sweep(scene, suspects, tracks, layers, stale=stale, number=sweep)
-        return self._weigh(scene, tracks, layers)
+    def look(self, scene: ObservedScene, suspect: Suspect, *, among: int) -> Track:
+        """One candidate alone on the plane; the budget of iterations is divided ``among`` so many."""
+        share = self._settings.iterations // max(1, among)
+        key = _extended(_extended_by(self._observation_key(scene, share), b"alone"), suspect)
+        return self._remembered(key, scene, scene.plane_inverse, suspect, share)
+
+    def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Glimpse:
+        """What a track would show, for the first ranking of combinations."""
+        return glimpse(scene, self._layer(scene, suspect, track.T_camera_object), suspect.box, self._settings.cost)
+
+    def estimate(
+        self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Track] | None = None, *,
+        reached: float = np.inf,
+    ) -> SceneResult:  # fmt: skip
+        """The most likely scene of the suspects, most confident first.
+
+        ``starts`` are the looks at each alone, taken here where they are not at hand. A scene that costs ``reached`` is
+        known: a hypothesis whose scenes all must cost more is dropped.
+        """
+        if not self.looks_first:
+            tracks = self._sequence(scene, suspects)
+            layers = self._layers(scene, suspects, tracks)
+            return self._result(scene, tracks, layers, scene_cost(scene, layers, self._settings.cost))
+        begun = list(starts or [self.look(scene, suspect, among=len(suspects)) for suspect in suspects])
+        draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), self._composition(scene, suspects))
+        if (bound := draft.composition.bound()) > reached:
+            return self._result(scene, begun, draft.layers, bound, dropped=True)
+        self._settle(draft)
+        return self._result(scene, draft.tracks, draft.layers, draft.cost)
+
+    def begun_cost(self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Floats]) -> float:
+        """What the scene of first looks costs, poses 3 x 4; estimating its hypothesis ends no higher."""
+        key = self._observation_key(scene, 0)
+        for suspect, start in zip(suspects, starts, strict=True):
+            key = _extended_by(_extended(key, suspect), start.tobytes())
+        if key not in self._costs:
+            layers = [self._layer(scene, s, pose) for s, pose in zip(suspects, starts, strict=True)]
+            self._costs[key] = self._composition(scene, suspects).cost(layers)
+            if len(self._costs) > self._memory:
+                self._costs.popitem(last=False)
+        return self._costs[key]
+
+    def charge(self, scene: ObservedScene, suspects: Sequence[Suspect], poses: Sequence[Floats]) -> float:
+        """The cost of all readings on the objects' silhouettes, hidden or not, were none of them explained."""
+        layers = (self._layer(scene, s, pose) for s, pose in zip(suspects, poses, strict=True))
+        return self._settings.cost.truncation * sum(silhouette(scene, layer) for layer in layers)
 
     def _sequence(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> list[Track]:
         share = self._settings.iterations // max(1, len(suspects))
@@ -112,69 +161,87 @@ class SceneFilter:
                 self._tracks.popitem(last=False)
         return self._tracks[key]
 
-    def _rescue(
-        self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: list[Track], layers: list[Float32s]
-    ) -> None:
-        """Starts the filter anew for objects that explain nothing, now that the readings of the others are explained.
+    def _settle(self, draft: _Draft) -> None:
+        """Visits objects again, the others known, until nothing changes or the sweeps are used up."""
+        poor = {i for i, found in enumerate(self._fits(draft)) if found.cost > self._settings.poor}
+        stale = poor | {i for i in range(len(draft.suspects)) if draft.is_reached(i)}
+        for number in range(self._settings.sweeps):
+            if number == 1:
+                stale |= self._rescue(draft)
+            stale = self._sweep(draft, stale, number)
 
-        A tray that is estimated first sees the things that stand on it as readings in front of it, and may hide.
+    def _sweep(self, draft: _Draft, stale: set[int], number: int) -> set[int]:
+        """Visits the stale objects with all others known; returns those around which something changed.
+
+        The worst fits come first: an object that alone took another's place must leave before that one is visited.
         """
-        share = self._settings.iterations // max(1, len(suspects))
-        key = _extended_by(self._observation_key(scene, share), b"rescue")
-        cost = scene_cost(scene, layers, self._settings.cost)
-        for i, suspect in enumerate(suspects if self._settings.sweeps else ()):
-            key = _extended(key, suspect)
-            others = layers[:i] + layers[i + 1 :]
-            without = scene_cost(scene, others, self._settings.cost)
-            if cost < without * (1 - _IDLE):
-                continue
-            box = pixels(suspect.box, scene)
-            track = self._filter(suspect.label).run(
-                scene, _composite(scene, others), box, iterations=share, rng=_generator(key)
-            )
-            layer = self._layer(scene, suspect, track)
-            found = scene_cost(scene, [*others, layer], self._settings.cost)
-            if found < without:
-                tracks[i], layers[i], cost = track, layer, found
-
-    def _sweep(
-        self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: list[Track], layers: list[Float32s], *,
-        stale: set[int], number: int,
-    ) -> set[int]:  # fmt: skip
-        """Visits the stale objects again with all others known; returns those around which something changed."""
-        key = self._observation_key(scene, number)
+        keys = self._keys(draft, b"sweep%d" % number)
+        fits = [found.cost for found in self._fits(draft)]
         changed: set[int] = set()
-        for i, suspect in enumerate(suspects):
-            key = _extended(key, suspect)
-            if i not in stale:
-                continue
-            others = _composite(scene, layers[:i] + layers[i + 1 :])
-            box = pixels(suspect.box, scene)
-            track = self._filter(suspect.label).revisit(scene, others, box, tracks[i], rng=_generator(key))
-            if track is not tracks[i]:
-                tracks[i], layers[i] = track, self._layer(scene, suspect, track)
-                changed |= {j for j in range(len(suspects)) if self._seen_by(scene, suspects[j], [layers[i]])}
+        for i in sorted(stale, key=lambda i: (-fits[i], i)):
+            box = pixels(draft.suspects[i].box, draft.scene)
+            visit = self._filter(draft.suspects[i].label).revisit
+            track = visit(draft.scene, draft.background(i), box, draft.tracks[i], rng=_generator(keys[i]))
+            if track is not draft.tracks[i]:
+                changed |= self._moved(draft, i, track)
         return changed
 
-    def _seen_by(self, scene: ObservedScene, suspect: Suspect, layers: Sequence[Float32s]) -> bool:
-        """Whether one of the layers reaches into a suspect's box."""
-        x0, y0, x1, y1 = pixels(suspect.box, scene)
-        return any(bool((layer[y0:y1, x0:x1] > 0).any()) for layer in layers)
+    def _rescue(self, draft: _Draft) -> set[int]:
+        """Starts the filter anew for objects that explain nothing, now that the readings of the others are explained.
 
-    def _weigh(self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s]) -> SceneResult:
-        return SceneResult(tuple(self._found(scene, tracks, layers)), scene_cost(scene, layers, self._settings.cost))
+        A tray that is looked at alone sees the things that stand on it as readings in front of it, and may hide.
+        """
+        keys = self._keys(draft, b"rescue")
+        share = self._settings.iterations // max(1, len(keys))
+        changed: set[int] = set()
+        for i, suspect in enumerate(draft.suspects):
+            without, left = draft.without(i)
+            if draft.cost < without * (1 - _IDLE) or left < _LEFT:
+                continue
+            run = self._filter(suspect.label).run
+            box = pixels(suspect.box, draft.scene)
+            track = run(draft.scene, draft.background(i), box, iterations=share, rng=_generator(keys[i]))
+            changed |= self._moved(draft, i, track)
+        return changed
+
+    def _moved(self, draft: _Draft, i: int, track: Track) -> set[int]:
+        """Takes another track of an object where that lowers the cost; returns the objects into whose boxes it came."""
+        layer = self._layer(draft.scene, draft.suspects[i], track.T_camera_object)
+        return draft.others_reached(i) if draft.take(i, track, layer) else set()
+
+    def _composition(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> Composition:
+        return Composition(scene, self._settings.cost, [suspect.box for suspect in suspects])
+
+    def _fits(self, draft: _Draft) -> Iterator[Found]:
+        return self._found(draft.scene, draft.tracks, draft.layers)
+
+    def _result(
+        self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s], cost: float, *,
+        dropped: bool = False,
+    ) -> SceneResult:  # fmt: skip
+        return SceneResult(tuple(self._found(scene, tracks, layers)), cost, dropped)
 
     def _found(self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s]) -> Iterator[Found]:
         for i, track in enumerate(tracks):
             yield _fit(scene, track, layers[i], _composite(scene, [*layers[:i], *layers[i + 1 :]]), self._settings.cost)
+
+    def _keys(self, draft: _Draft, purpose: bytes) -> list[bytes]:
+        """One seed an object, from the observation and all of the hypothesis."""
+        key = _extended_by(self._observation_key(draft.scene, 0), purpose)
+        for suspect in draft.suspects:
+            key = _extended(key, suspect)
+        return [_extended_by(key, b"%d" % i) for i in range(len(draft.suspects))]
 
     def _filter(self, label: str) -> ObjectFilter:
         if label not in self._filters:
             self._filters[label] = ObjectFilter(self._catalogue[label], self._settings)
         return self._filters[label]
 
-    def _layer(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Float32s:
-        return inverse_depth(self._filter(suspect.label).fine.soup, track.T_camera_object, scene.view)
+    def _layers(self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: Sequence[Track]) -> list[Float32s]:
+        return [self._layer(scene, s, track.T_camera_object) for s, track in zip(suspects, tracks, strict=True)]
+
+    def _layer(self, scene: ObservedScene, suspect: Suspect, T_camera_object: Floats) -> Float32s:
+        return inverse_depth(self._filter(suspect.label).fine.soup, T_camera_object, scene.view)
 
     def _added(self, background: Float32s, scene: ObservedScene, suspect: Suspect, track: Track) -> Float32s:
         return with_object(background, self._filter(suspect.label).fine.soup, track.T_camera_object, scene.view)
@@ -186,22 +253,49 @@ class SceneFilter:
         return digest.digest()
 
 
-def scene_cost(scene: ObservedScene, layers: Sequence[Float32s], form: CostForm) -> float:
-    """d(R, O) of a whole scene, metres times pixels: the same pixels count whatever the hypothesis.
+class _Draft:
+    """The scene of one hypothesis while it is estimated."""
 
-    ``layers`` are the objects' inverse depths, H x W. Foreground that no object explains costs what it would cost
-    with the support plane alone.
-    """
-    cost = credits(scene, scene.plane_inverse, form)
-    if not layers:
-        return float(cost.sum(dtype=np.float64))
-    rendered = np.maximum.reduce(list(layers))
-    shown = (rendered > scene.plane_inverse) & (scene.factor > 0)
-    behind = scene.factor * (1.0 / np.where(shown, rendered, 1.0) - scene.depth)
-    explained = np.minimum(np.abs(behind), form.truncation)
-    hidden = behind > form.occluder_margin
-    cost = np.where(shown, np.where(hidden, cost + form.occluder_cost, explained), cost)
-    return float(cost.sum(dtype=np.float64))
+    def __init__(
+        self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: Sequence[Track], layers: list[Float32s],
+        composition: Composition,
+    ) -> None:  # fmt: skip
+        self.scene = scene
+        self.suspects = suspects
+        self.tracks = list(tracks)
+        self.layers = layers
+        self.composition = composition
+        self.cost = composition.cost(layers)
+        self._windows = [_window(scene, suspect) for suspect in suspects]
+
+    def background(self, i: int) -> Float32s:
+        """The plane and all objects but one."""
+        return _composite(self.scene, self.layers[:i] + self.layers[i + 1 :])
+
+    def is_reached(self, i: int) -> bool:
+        """Whether another object's layer reaches into the box of object i."""
+        return any(j != i and bool((self.layers[j][self._windows[i]] > 0).any()) for j in range(len(self.layers)))
+
+    def others_reached(self, i: int) -> set[int]:
+        """The objects into whose boxes the layer of object i reaches, itself among them."""
+        return {j for j, window in enumerate(self._windows) if bool((self.layers[i][window] > 0).any())}
+
+    def without(self, i: int) -> tuple[float, float]:
+        """Cost of the scene without one object, and the share of what stands in its box that is then unexplained."""
+        return self.composition.without(i, self.layers)
+
+    def take(self, i: int, track: Track, layer: Float32s) -> bool:
+        """Moves an object where that lowers the cost of the scene."""
+        cost = self.composition.cost([*self.layers[:i], layer, *self.layers[i + 1 :]])
+        if cost >= self.cost:
+            return False
+        self.tracks[i], self.layers[i], self.cost = track, layer, cost
+        return True
+
+
+def _window(scene: ObservedScene, suspect: Suspect) -> tuple[slice, slice]:
+    x0, y0, x1, y1 = pixels(suspect.box, scene)
+    return np.s_[y0:y1, x0:x1]
 
 
 def _fit(scene: ObservedScene, track: Track, layer: Float32s, others: Float32s, form: CostForm) -> Found:
