@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from stages.perception.pixel_math import INLINED, KERNEL, height_row, pixel_cost, screen_matrix
-from stages.perception.rasteriser import fill, screen_bounds, set_up
+from stages.perception.rasteriser import LANES, SIDE, rasterise, screen_window, tiled, untile, working_memory
 
 IMPOSSIBLE = 1e6
 """Cost of a pose that reaches into the camera, in metres times pixels."""
@@ -20,40 +20,41 @@ _u = np.uintp
 
 @numba.njit(**KERNEL)
 def change_of_cost(lanes, blocks, corners, support, poses, view, background, observed, factor, credit, plane, limits,
-              Z, scratch, out):  # fmt: skip
+              out):  # fmt: skip
     """Writes for each pose what its visible pixels cost less what the background costs there, plus sinking."""
-    width = int(view[4])
+    Z, scratch, survivors = working_memory(blocks, view)
+    images = np.zeros((4, Z.shape[0]), np.float32)
+    tiled(background, view, images[0])
+    tiled(observed, view, images[1])
+    tiled(factor, view, images[2])
+    tiled(credit, view, images[3])
+    pitch = (int(view[4]) + SIDE - 1) // SIDE
     area = view[4] * view[5]
     for p in range(poses.shape[0]):
         m = screen_matrix(poses[p], view)
-        x0, y0, x1, y1 = screen_bounds(corners, m, view)
-        if x0 > view[4]:
-            out[p] = _f(IMPOSSIBLE)
-            continue
+        window, inside, too_near = screen_window(corners, m, view)
         sunk = _depth_below(support, poses[p], plane) - limits[3]
-        out[p] = max(_f(0), sunk) * area
-        if x1 < x0 or y1 < y0:
-            continue
-        columns = int(x1 - x0) + 1
-        set_up(lanes, blocks, m, x0, x1, y0, y1, scratch)
-        fill(scratch, blocks, Z, columns)
-        out[p] += _scan(Z, int(x0), int(y0), columns, int(y1 - y0) + 1, width, background, observed, factor, credit,
-                        limits)  # fmt: skip
+        out[p] = _f(IMPOSSIBLE) if too_near else max(_f(0), sunk) * area
+        if inside:
+            rasterise(lanes, blocks, m, window, scratch, survivors, Z)
+            out[p] += _scan(Z, window, pitch, images[0], images[1], images[2], images[3], limits)
 
 
 @numba.njit(**INLINED)
-def _scan(Z, x0, y0, columns, rows, width, background, observed, factor, credit, limits):
+def _scan(Z, window, pitch, background, observed, factor, credit, limits):
     """Sums the change of cost over the object's visible pixels and leaves the z-buffer zeroed."""
+    left, top, across, down = window[0], window[1], window[2], window[3]
     truncation, margin, occluder = limits[0], limits[1], limits[2]
     total = _f(0)
-    for y in range(_u(rows)):
-        z = y * _u(columns)
-        o = (_u(y0) + y) * _u(width) + _u(x0)
-        for x in range(_u(columns)):
-            q = Z[z + x]
-            Z[z + x] = _f(0)
+    for row in range(_u(down)):
+        z = row * _u(across * LANES)
+        o = ((_u(top) + row) * _u(pitch) + _u(left)) * _u(LANES)
+        for x in range(_u(across * LANES)):
             i = o + x
-            total += pixel_cost(q, background[i], observed[i], factor[i], credit[i], truncation, margin, occluder)
+            total += pixel_cost(
+                Z[z + x], background[i], observed[i], factor[i], credit[i], truncation, margin, occluder
+            )
+            Z[z + x] = _f(0)
     return total
 
 
@@ -68,9 +69,10 @@ def _depth_below(support, pose, plane):
 
 
 @numba.njit(**KERNEL)
-def gauss_newton(lanes, blocks, corners, centre, poses, steps, gate, view, background, observed, factor, directions,
-                  Z, scratch):  # fmt: skip
+def gauss_newton(lanes, blocks, corners, centre, poses, steps, gate, view, background, observed, factor, directions):
     """Moves each pose, in place, by steps of projective point-to-plane ICP."""
+    tiles, scratch, survivors = working_memory(blocks, view)
+    image = np.zeros(tiles.shape[0], np.float32)
     degrees = directions.shape[1]
     A = np.zeros((degrees, degrees))
     b = np.zeros(degrees)
@@ -81,19 +83,19 @@ def gauss_newton(lanes, blocks, corners, centre, poses, steps, gate, view, backg
         reach = gate
         for _ in range(steps):
             m = screen_matrix(poses[p].astype(np.float32), view)
-            x0, y0, x1, y1 = screen_bounds(corners, m, view)
-            if x1 < x0 or y1 < y0:
+            window, inside, _ = screen_window(corners, m, view)
+            if not inside:
                 break
-            columns, rows = int(x1 - x0) + 1, int(y1 - y0) + 1
-            set_up(lanes, blocks, m, x0, x1, y0, y1, scratch)
-            fill(scratch, blocks, Z, columns)
+            rasterise(lanes, blocks, m, window, scratch, survivors, tiles)
+            left, top = SIDE * window[0], SIDE * window[1]
+            columns, rows = min(SIDE * window[2], int(view[4]) - left), min(SIDE * window[3], int(view[5]) - top)
+            untile(tiles, window, image[: columns * rows].reshape(rows, columns))
             for i in range(3):
                 middle[i] = poses[p, i, 3]
                 for j in range(3):
                     middle[i] += poses[p, i, j] * centre[j]
-            used = _normal_equations(Z, int(x0), int(y0), columns, rows, view, background, observed, factor,
-                                     middle, reach, directions, A, b, row)  # fmt: skip
-            Z[: columns * rows] = _f(0)
+            used = _normal_equations(image, left, top, columns, rows, view, background,
+                                     observed, factor, middle, reach, directions, A, b, row)  # fmt: skip
             if used < 12:
                 break
             _solve(A, b)

@@ -188,8 +188,6 @@ class ObjectLikelihood:
         self.window = window
         self.form = form
         self._plane = scene.plane
-        self._z_buffer = np.zeros(window.view.height * window.view.width, np.float32)
-        self._scratch = shape.soup.scratch()
         self.base = float(window.credit.sum(dtype=np.float64))
         """Cost of the window without the object."""
         self._on_gpu = None if device == "cpu" else cuda_evaluator(shape, window, scene.plane, form)
@@ -206,7 +204,7 @@ class ObjectLikelihood:
         change_of_cost(
             soup.lanes, soup.blocks, soup.corners, self.shape.support, np.ascontiguousarray(poses, np.float32),
             window.view.numbers, window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
-            window.credit.ravel(), self._plane, limits, self._z_buffer, self._scratch, out,
+            window.credit.ravel(), self._plane, limits, out,
         )  # fmt: skip
         return out
 
@@ -246,7 +244,7 @@ class ObjectLikelihood:
         gauss_newton(
             soup.lanes, soup.blocks, soup.corners, self.shape.centre, moved, steps, gate, window.view.numbers,
             window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
-            np.ascontiguousarray(directions), self._z_buffer, self._scratch,
+            np.ascontiguousarray(directions),
         )  # fmt: skip
         return moved
 

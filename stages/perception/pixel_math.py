@@ -29,7 +29,11 @@ KERNEL: dict[str, Any] = {
 # A function that kernels call must vanish into them: otherwise two copies of it exist, compiled in different
 # surroundings, and which one runs depends on whether this process compiled the kernel or loaded it from the cache.
 INLINED: dict[str, Any] = KERNEL | {"forceinline": True}
+THIN = 1e-4
+"""Pixels: a triangle thinner than this covers no pixel but by chance, and its weights there are rounding."""
+
 _f = np.float32
+_THIN = np.float32(THIN)
 _ZERO = np.float32(0)
 _ONE = np.float32(1)
 
@@ -73,13 +77,14 @@ def triangle_setup(ax, ay, az, bx, by, bz, cx, cy, cz, m, left, right, top, bott
     y0 = max(top, ceil(va + min(_ZERO, min(vb, vd))))
     y1 = min(bottom, floor(va + max(_ZERO, max(vb, vd))))
     area = ub * vd - vb * ud
+    thinnest = _THIN * (abs(ub) + abs(vb) + abs(ud) + abs(vd))
     inverse_area = _ONE / area
     b_x, b_y = vd * inverse_area, -ud * inverse_area
     d_x, d_y = -vb * inverse_area, ub * inverse_area
     q_x, q_y = b_x * qb + d_x * qd, b_y * qb + d_y * qd
     px, py = x0 - ua, y0 - va
     # Seen from outside, a counter-clockwise face turns clockwise on a screen whose y points down.
-    width = x1 - x0 + _ONE if area < _ZERO else _ZERO
+    width = x1 - x0 + _ONE if area < -thinnest else _ZERO
     return (width, y1 - y0 + _ONE, x0 - left, y0 - top,
             b_x * px + b_y * py, d_x * px + d_y * py, qa + q_x * px + q_y * py,
             b_x, b_y, d_x, d_y, q_x, q_y)  # fmt: skip
