@@ -203,7 +203,7 @@ def _run(options: argparse.Namespace) -> int:
             file.writelines(f"{line.line()}\n" for line in lines)
             print(f"{image.frame.name}: {one.seconds:.2f} s, {one.cpu_seconds:.2f} s of CPU", flush=True)
     truths = [truth for image in chosen for truth in image.truths]
-    scores = score(truths, found, catalogue)
+    scores = score(truths, found, catalogue, {image.id: (image.depth, image.K) for image in chosen})
     print(table(scores, right_sets(truths, found)))
     print(failures(scores, catalogue))
     return 0
