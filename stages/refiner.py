@@ -10,7 +10,7 @@ import msgspec
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
-from stages.perception.doubt import Judge, Judged, Rival, annotated
+from stages.perception.doubt import Judge, annotated, judged
 from stages.perception.likelihood import ObservedScene
 from stages.perception.particle_filter import FilterSettings
 from stages.perception.poses import pose
@@ -57,17 +57,10 @@ class Refiner(Stage):
         scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
         placed = [Placed(item.label, item.T_camera_object) for item in scene_estimate.objects]
         refined = self._refiner.refine(scene, observation.rgb, placed)
-        judged = tuple(map(_judged, scene_estimate.objects, refined.objects))
-        doubt = self._judge.assess(scene, judged, scene_estimate.log_weights, scene_estimate.winner)
+        doubted = tuple(map(judged, scene_estimate.objects, refined.objects))
+        doubt = self._judge.assess(scene, doubted, scene_estimate.log_weights, scene_estimate.winner)
         objects = tuple(map(_object, scene_estimate.objects, refined.objects))
         return annotated(msgspec.structs.replace(scene_estimate, objects=objects), doubt)
-
-
-def _judged(item: ObjectPose, refined: RefinedObject) -> Judged:
-    mine, *others = refined.considered or (None,)
-    own = None if mine is None else mine.colour
-    rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
-    return Judged(refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals))
 
 
 def _object(item: ObjectPose, refined: RefinedObject) -> ObjectPose:

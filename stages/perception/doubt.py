@@ -24,6 +24,7 @@ from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedSce
 from stages.perception.poses import compose, exp_so3, pose, rotate, symmetry_angle
 from stages.perception.proposals import Dof, Proposals, distinct_best
 from stages.perception.rasteriser import Float32s, inverse_depth
+from stages.perception.refinement import RefinedObject
 from stages.perception.unexplained import Region, is_contradicted, looked_through, unknown_regions
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
@@ -61,7 +62,7 @@ class Calibration:
     """Constants that turn costs and evidence into probabilities."""
 
     hypothesis_scale: float
-    """Truncated pixels per object by which scenes must differ for one nat."""
+    """Objects left unexplained by which scenes must differ for one nat."""
     pose_scale: float
     """Readings that count as one independent reading when poses of an object are compared."""
     spread_scale: float
@@ -178,17 +179,29 @@ class SceneDoubt:
     unknown: tuple[Region, ...]
 
 
-def hypothesis_probabilities(log_weights: Floats, scene: ObservedScene, objects: int, scale: float) -> Floats:
-    """Probability of each hypothesis, summing to 1.
+def cost_of_an_object(scene: ObservedScene, objects: int) -> float:
+    """What it costs to leave an object of ordinary size in the image unexplained, metres times pixels.
 
-    ``log_weights`` are minus the costs of equation 9, metres times pixels. They are counted in pixels at the bound,
-    as a share of the foreground that one of ``objects`` has on average, so that neither the size of the image nor
-    that of the objects matters; ``scale`` of those are one nat.
+    Costs of scenes are compared in these, so that neither the image's resolution nor the objects' size matters.
     """
-    share = max(1.0, float(scene.foreground.sum()) / max(1, objects))
-    nats = (log_weights - log_weights.max()) / (CostForm().truncation * share * scale)
-    weights = np.exp(nats)
+    return CostForm().truncation * max(1.0, float(scene.foreground.sum()) / max(1, objects))
+
+
+def hypothesis_probabilities(log_weights: Floats, nat: float) -> Floats:
+    """Probability of each hypothesis, summing to 1; ``nat`` is the difference of log-weights that is one nat.
+
+    ``log_weights`` are minus the costs of equation 9, metres times pixels.
+    """
+    weights = np.exp((log_weights - log_weights.max()) / nat)
     return weights / weights.sum()
+
+
+def judged(item: ObjectPose, refined: RefinedObject) -> Judged:
+    """An object as the refiner leaves it, with the poses it compared by colour."""
+    mine, *others = refined.considered or (None,)
+    own = None if mine is None else mine.colour
+    rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
+    return Judged(refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals))
 
 
 def annotated(estimate: SceneEstimate, doubt: SceneDoubt) -> SceneEstimate:
@@ -235,19 +248,28 @@ class Judge:
 
     def assess(self, scene: ObservedScene, objects: Sequence[Judged], log_weights: Floats, winner: int) -> SceneDoubt:
         """How sure the winning scene is; ``log_weights`` are those of all hypotheses of the image."""
-        constants = self._calibration
-        probabilities = hypothesis_probabilities(log_weights, scene, len(objects), constants.hypothesis_scale)
-        models = [self._model(item.label) for item in objects]
-        layers = [
-            inverse_depth(model.shape.soup, item.T_camera_object, scene.view)
-            for model, item in zip(models, objects, strict=True)
-        ]
-        doubts: list[PoseDoubt] = []
+        nat = self._calibration.hypothesis_scale * cost_of_an_object(scene, len(objects))
+        probabilities = hypothesis_probabilities(log_weights, nat)
+        layers = self.layers(scene, objects)
+        found = self.evidence(scene, objects, layers, float(probabilities[winner]))
+        doubts = tuple(_doubt(evidence, self._calibration) for evidence in found)
+        return SceneDoubt(probabilities, doubts, unknown_regions(scene, layers))
+
+    def evidence(
+        self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
+    ) -> list[Evidence]:
+        """What the image says of each object's pose; ``hypothesis`` is the probability of the scene's."""
+        found: list[Evidence] = []
         for i, item in enumerate(objects):
             others = np.maximum.reduce([scene.plane_inverse, *layers[:i], *layers[i + 1 :]])
-            look = _Look(scene, models[i], np.array(item.T_camera_object[:3], float), layers[i], others)
-            doubts.append(_judged(look.evidence(item, constants, float(probabilities[winner])), constants))
-        return SceneDoubt(probabilities, tuple(doubts), unknown_regions(scene, layers))
+            T = np.array(item.T_camera_object[:3], float)
+            look = _Look(scene, self._model(item.label), T, layers[i], others)
+            found.append(look.evidence(item, self._calibration, hypothesis))
+        return found
+
+    def layers(self, scene: ObservedScene, objects: Sequence[Judged]) -> list[Float32s]:
+        """The inverse depth of each object alone, H x W."""
+        return [inverse_depth(self._model(o.label).shape.soup, o.T_camera_object, scene.view) for o in objects]
 
     def _model(self, label: str) -> _Model:
         if label not in self._models:
@@ -255,7 +277,7 @@ class Judge:
         return self._models[label]
 
 
-def _judged(evidence: Evidence, constants: Calibration) -> PoseDoubt:
+def _doubt(evidence: Evidence, constants: Calibration) -> PoseDoubt:
     """Alternatives keep their odds against the estimate, but share no more than what it leaves to 1."""
     probability = constants.probability(evidence.features())
     shares = probability * evidence.relative

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
-from stages.perception.doubt import Calibration, Evidence, Judge, Judged, Rival, SceneDoubt, hypothesis_probabilities
+from stages.perception.doubt import (
+    Calibration,
+    Evidence,
+    Judge,
+    Judged,
+    Rival,
+    SceneDoubt,
+    cost_of_an_object,
+    hypothesis_probabilities,
+)
 from stages.perception.poses import pose
 from stages.scene.catalogue import Floats
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
@@ -102,12 +111,17 @@ def test_noise_and_edges_are_no_unknown_objects(noise: float) -> None:
 
 
 def test_hypotheses_get_probabilities_that_sum_to_one() -> None:
-    scene = render({"tea_box": BOX}).scene
     log_weights = np.array([-40.0, -42.0, -60.0, -1e9])
-    found = hypothesis_probabilities(log_weights, scene, 1, 0.05)
-    assert found.sum() == pytest.approx(1) and list(np.argsort(-found)) == [0, 1, 2, 3]
-    assert hypothesis_probabilities(log_weights[:1], scene, 1, 0.05).tolist() == [1.0]
-    assert hypothesis_probabilities(log_weights[:3], scene, 1, 1e12) == pytest.approx(np.full(3, 1 / 3))
+    found = hypothesis_probabilities(log_weights, 2.0)
+    assert found.sum() == pytest.approx(1) and found[0] / found[1] == pytest.approx(np.e)
+    assert list(np.argsort(-found)) == [0, 1, 2, 3]
+    assert hypothesis_probabilities(log_weights[:1], 2.0).tolist() == [1.0]
+    assert hypothesis_probabilities(log_weights[:3], 1e12) == pytest.approx(np.full(3, 1 / 3))
+
+
+def test_an_object_costs_what_its_share_of_the_foreground_could() -> None:
+    scene = render({"tea_box": BOX}).scene
+    assert cost_of_an_object(scene, 2) == pytest.approx(0.03 * scene.foreground.sum() / 2)
 
 
 def test_equal_scenes_are_judged_with_equal_bytes() -> None:
