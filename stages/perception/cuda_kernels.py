@@ -16,8 +16,18 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from stages.perception.cuda_math import cuda, height_row, pixel_cost, screen_bounds, screen_matrix, triangle_setup
+from stages.perception.cuda_math import (
+    ceil,
+    cuda,
+    floor,
+    height_row,
+    pixel_cost,
+    project,
+    screen_matrix,
+    triangle_setup,
+)
 from stages.perception.kernels import IMPOSSIBLE
+from stages.perception.pixel_math import NEAR
 from stages.perception.rasteriser import LANES
 
 _f = np.float32
@@ -25,6 +35,7 @@ _i = np.int32
 _ZERO = np.float32(0)
 _ONE = np.float32(1)
 _FAR = np.float32(1e9)
+_NEAR = np.float32(NEAR)
 _IMPOSSIBLE = np.float32(IMPOSSIBLE)
 _BLOCK = 9 * LANES
 """Values per block of triangles."""
@@ -41,8 +52,8 @@ def evaluate(lanes, meshes, corners, support, views, firsts, pixels, planes, lim
     mesh, view = meshes[objects[p]], views[windows[p]]
     bound = limits[windows[p]]
     m = screen_matrix(poses[p], view)
-    x0, y0, x1, y1 = screen_bounds(corners[objects[p]], m, view)
-    if x0 > view[4]:
+    x0, y0, x1, y1, nearest = _rectangle(corners[objects[p]], m, view)
+    if nearest < _NEAR:
         if cuda.threadIdx.x == 0:
             out[p] = _IMPOSSIBLE
         return
@@ -53,6 +64,19 @@ def evaluate(lanes, meshes, corners, support, views, firsts, pixels, planes, lim
     total = _sum(total)
     if cuda.threadIdx.x == 0:
         out[p] = max(_ZERO, -lowest - bound[3]) * view[4] * view[5] + total
+
+
+@cuda.jit(device=True)
+def _rectangle(corners, m, view):
+    """First and last pixel x0, y0, x1, y1 that the enclosing box may touch, and the depth of its nearest corner."""
+    u0 = v0 = nearest = _FAR
+    u1 = v1 = -_FAR
+    for i in range(8):
+        u, v, q = project(corners[i, 0], corners[i, 1], corners[i, 2], m)
+        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+        nearest = min(nearest, _ONE / q)
+    return (max(_ZERO, ceil(u0)), max(_ZERO, ceil(v0)),
+            min(view[4] - _ONE, floor(u1)), min(view[5] - _ONE, floor(v1)), nearest)  # fmt: skip
 
 
 @cuda.jit(device=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numba.cuda
 import numpy as np
 
-from stages.perception import pixel_math, rasteriser
+from stages.perception import pixel_math
 
 cuda: Any = numba.cuda
 """numba.cuda, whose type information covers neither its launches nor its shared arrays."""
@@ -39,7 +39,6 @@ def on_device(function: Any, **names: Any) -> Any:
 
 project = on_device(pixel_math.project)
 screen_matrix = on_device(pixel_math.screen_matrix)
-screen_bounds = on_device(rasteriser.screen_bounds)
 triangle_setup = on_device(pixel_math.triangle_setup, project=project)
 pixel_cost = on_device(pixel_math.pixel_cost)
 height_row = on_device(pixel_math.height_row)

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +22,26 @@ i1, i2 = int32[::1], int32[:, ::1]
 SIGNATURES = {
     "evaluate": (cuda_kernels.evaluate, void(f1, i2, f3, f2, f2, i1, f2, f2, f2, f3, i1, i1, f1)),
 }
+MISSING = 3
+"""Exit status where the toolkit is not at hand."""
+
+
+def obstacle() -> str:
+    """Why nothing can be compiled here, or nothing."""
+    if importlib.util.find_spec("numba_cuda") is None:
+        return "the package numba-cuda is not installed"
+    from cuda import pathfinder
+
+    for library in ("nvvm", "nvrtc"):
+        try:
+            pathfinder.load_nvidia_dynamic_lib(library)
+        except pathfinder.DynamicLibNotFoundError:
+            return f"CUDA's {library} library is not installed"
+    try:
+        subprocess.run(["ptxas", "--version"], capture_output=True, check=True)
+    except FileNotFoundError:
+        return "ptxas is not on the path"
+    return ""
 
 
 def ptx(name: str) -> str:
@@ -29,17 +51,29 @@ def ptx(name: str) -> str:
     return code
 
 
-def main(folder: Path) -> None:
+def report(name: str, folder: Path) -> str:
+    """Registers, spills and double-precision instructions of one kernel, in a line."""
+    source = folder / f"{name}.ptx"
+    source.write_text(ptx(name))
+    command = ["ptxas", "-v", "-arch=sm_90", str(source), "-o", str(folder / f"{name}.cubin")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    registers, spilt = re.search(r"Used (\d+) registers", said), re.search(r"(\d+) bytes spill stores", said)
+    assert registers and spilt, said
+    doubles = len(re.findall(r"^\s*\w+[\w.]*\.f64\s", source.read_text(), re.MULTILINE))
+    return f"{name}: {registers[1]} registers, {spilt[1]} bytes spilt, {doubles} instructions in double precision"
+
+
+def main(folder: Path) -> int:
+    if reason := obstacle():
+        print(reason)
+        return MISSING
     # Device functions that kernels call ask for the current device; nothing else of the compiler does.
     device = SimpleNamespace(compute_capability=(9, 0))
     numba.cuda.dispatcher.get_current_device = lambda: device
     for name in SIGNATURES:
-        source = folder / f"{name}.ptx"
-        source.write_text(ptx(name))
-        command = ["ptxas", "-v", "-arch=sm_90", str(source), "-o", str(folder / f"{name}.cubin")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        print(name, done.returncode, done.stderr, sep="\n")
+        print(report(name, folder))
+    return 0
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    sys.exit(main(Path(sys.argv[1])))

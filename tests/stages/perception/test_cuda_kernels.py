@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[3]
+NO_TOOLKIT = 3
 
 
 def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -23,3 +24,13 @@ def test_kernels_in_the_simulator() -> None:
                NUMBA_ENABLE_CUDASIM="1")  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "skipped" not in done.stdout
+
+
+@pytest.mark.slow
+def test_kernels_compile_for_a_hopper_card(tmp_path: Path) -> None:
+    done = run("tests.stages.perception.cuda_ptx", str(tmp_path), NUMBA_FORCE_CUDA_CC="9.0")
+    if done.returncode == NO_TOOLKIT:
+        pytest.skip(done.stdout.strip())
+    assert done.returncode == 0, done.stdout + done.stderr
+    for line in done.stdout.splitlines():
+        assert " 0 bytes spilt, 0 instructions in double precision" in line
