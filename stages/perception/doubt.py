@@ -136,10 +136,6 @@ class Evidence:
     hypothesis: float
     """Probability of the scene's hypothesis."""
     confidence: float
-    alternatives: Floats
-    """A x 3 x 4, likeliest first."""
-    relative: Floats
-    """Weight of each alternative relative to the estimate's own."""
 
     def features(self) -> Floats:
         """The numbers that :data:`FEATURES` names."""
@@ -158,14 +154,26 @@ class Evidence:
 
 
 @dataclass(frozen=True)
+class Others:
+    """Poses that explain the image about as well as the estimate."""
+
+    poses: Floats
+    """A x 3 x 4, likeliest first."""
+    weights: Floats
+    """Of each, relative to the estimate's own."""
+
+
+@dataclass(frozen=True)
 class PoseDoubt:
     """How sure the pose of one object is."""
 
     evidence: Evidence
     probability: float
     """That the pose is right within 2 cm and 15 degrees, modulo symmetries."""
-    alternatives: tuple[float, ...]
-    """Probability of each of the evidence's alternatives."""
+    alternatives: Floats
+    """A x 3 x 4 other poses, likeliest first."""
+    shares: tuple[float, ...]
+    """Probability of each of them."""
     contradicted: bool
 
 
@@ -225,7 +233,7 @@ def _annotated(item: ObjectPose, found: PoseDoubt) -> ObjectPose:
         spread_radians=evidence.spread_radians,
         alternatives=tuple(
             Alternative(T_camera_object=pose(T[:, :3], T[:, 3]), probability=share)
-            for T, share in zip(evidence.alternatives, found.alternatives, strict=True)
+            for T, share in zip(found.alternatives, found.shares, strict=True)
         ),
         looked_through=evidence.looked_through,
         contradicted=found.contradicted,
@@ -252,14 +260,14 @@ class Judge:
         probabilities = hypothesis_probabilities(log_weights, nat)
         layers = self.layers(scene, objects)
         found = self.evidence(scene, objects, layers, float(probabilities[winner]))
-        doubts = tuple(_doubt(evidence, self._calibration) for evidence in found)
+        doubts = tuple(_doubt(*each, self._calibration) for each in found)
         return SceneDoubt(probabilities, doubts, unknown_regions(scene, layers))
 
     def evidence(
         self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
-    ) -> list[Evidence]:
+    ) -> list[tuple[Evidence, Others]]:
         """What the image says of each object's pose; ``hypothesis`` is the probability of the scene's."""
-        found: list[Evidence] = []
+        found: list[tuple[Evidence, Others]] = []
         for i, item in enumerate(objects):
             others = np.maximum.reduce([scene.plane_inverse, *layers[:i], *layers[i + 1 :]])
             T = np.array(item.T_camera_object[:3], float)
@@ -277,12 +285,13 @@ class Judge:
         return self._models[label]
 
 
-def _doubt(evidence: Evidence, constants: Calibration) -> PoseDoubt:
+def _doubt(evidence: Evidence, others: Others, constants: Calibration) -> PoseDoubt:
     """Alternatives keep their odds against the estimate, but share no more than what it leaves to 1."""
     probability = constants.probability(evidence.features())
-    shares = probability * evidence.relative
+    shares = probability * others.weights
     shares *= min(1.0, (1.0 - probability) / max(float(shares.sum()), 1e-9))
-    return PoseDoubt(evidence, probability, tuple(shares.tolist()), is_contradicted(evidence.looked_through))
+    contradicted = is_contradicted(evidence.looked_through)
+    return PoseDoubt(evidence, probability, others.poses, tuple(shares.tolist()), contradicted)
 
 
 class _Model:
@@ -309,8 +318,8 @@ class _Look:
         self._likelihood = _likelihood(scene, model.shape, pose, others)
         self._directions = model.proposals.directions(scene.T_camera_table)
 
-    def evidence(self, item: Judged, constants: Calibration, hypothesis: float) -> Evidence:
-        """Everything the image says of the pose."""
+    def evidence(self, item: Judged, constants: Calibration, hypothesis: float) -> tuple[Evidence, Others]:
+        """Everything the image says of the pose, and of others."""
         unit = _PIXEL * constants.pose_scale
         own = float(self._likelihood.costs(self._pose[None])[0])
         probes = self._probes(item.rivals)
@@ -322,7 +331,7 @@ class _Look:
         wide_metres, wide_radians = _profile(nats, metres, angles)
         chosen = self._alternatives(probes[away], nats[away])
         fit, shown, visible, gain = self._shown(own)
-        return Evidence(
+        evidence = Evidence(
             margin=float(nats[away].min(initial=_CAP)),
             fit=fit,
             shown=shown,
@@ -333,9 +342,8 @@ class _Look:
             spread_radians=constants.spread_scale * max(near_radians, wide_radians),
             hypothesis=hypothesis,
             confidence=item.confidence,
-            alternatives=probes[away][chosen],
-            relative=np.exp(-np.maximum(nats[away][chosen], 0.0)),
         )
+        return evidence, Others(probes[away][chosen], np.exp(-np.maximum(nats[away][chosen], 0.0)))
 
     def _colour(self, probes: Floats, rivals: Sequence[Rival]) -> Floats:
         """What colour says against each probe, nats: what it says against the rival that is nearly the same."""
@@ -398,8 +406,8 @@ class _Look:
         read = shown & (scene.factor > 0)
         distances = np.minimum(np.abs(behind[read]), form.truncation)
         fit = float(distances.mean(dtype=np.float64)) if len(distances) else form.truncation
-        count = len(distances) / self._stride**2
-        gain = (self._likelihood.base - own) / (form.truncation * max(1.0, count))
+        count = float(len(distances) / self._stride**2)
+        gain = float((self._likelihood.base - own) / (form.truncation * max(1.0, count)))
         return fit, count, float(shown.sum() / max(1, silhouette.sum())), gain
 
     @property

@@ -33,7 +33,7 @@ def assess(seen: Rendered, poses: dict[str, Floats] | None = None, *, dof: int =
 @pytest.mark.parametrize("dof", [3, 6])
 def test_a_box_in_plain_view_is_sure(dof: int) -> None:
     (found,) = assess(render({"tea_box": BOX}), dof=dof).objects
-    assert found.probability > 0.9 and not found.alternatives and not found.contradicted
+    assert found.probability > 0.9 and not found.shares and not found.contradicted
     assert found.evidence.spread_metres < 0.003 and found.evidence.spread_radians < np.deg2rad(4)
     assert found.evidence.visible > 0.95
 
@@ -44,17 +44,17 @@ def test_a_mug_with_a_hidden_handle_is_in_doubt(dof: int) -> None:
     (hidden,) = assess(render({"mug": HIDDEN_HANDLE}), dof=dof).objects
     assert hidden.probability < 0.9 < shown.probability
     assert hidden.evidence.spread_radians > np.deg2rad(8) > 2 * shown.evidence.spread_radians
-    assert hidden.alternatives and not shown.alternatives
+    assert hidden.shares and not shown.shares
     # What may be is turned about the upright axis and stands where the estimate stands.
-    (T, up) = hidden.evidence.alternatives[0], render({"mug": HIDDEN_HANDLE}).poses["mug"][:3, 2]
+    (T, up) = hidden.alternatives[0], render({"mug": HIDDEN_HANDLE}).poses["mug"][:3, 2]
     assert T[:, 2] @ up > 0.95
-    assert hidden.probability + sum(hidden.alternatives) <= 1 + 1e-9
+    assert hidden.probability + sum(hidden.shares) <= 1 + 1e-9
 
 
 def test_a_flip_that_depth_cannot_see_is_an_alternative() -> None:
     (found,) = assess(render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)})).objects
     assert found.evidence.margin < 1
-    upside_down = found.evidence.alternatives[0]
+    upside_down = found.alternatives[0]
     assert upside_down[:, 2] @ render({"soup_can": upright("soup_can", 0.0, 0.0, 0.0)}).poses["soup_can"][:3, 2] < -0.95
     # The other end up is another pose, not spread about this one.
     assert found.evidence.spread_radians < np.deg2rad(10)
@@ -69,7 +69,7 @@ def test_colour_settles_what_depth_cannot_see() -> None:
         for rivals in ((), (Rival(flipped, colour=5.0),))
     )
     assert after.probability > before.probability and after.evidence.margin > before.evidence.margin + 3
-    assert before.alternatives and not after.alternatives
+    assert before.shares and not after.shares
 
 
 def test_an_object_that_floats_before_the_readings_is_contradicted() -> None:
@@ -129,7 +129,7 @@ def test_equal_scenes_are_judged_with_equal_bytes() -> None:
     first, second = assess(seen), assess(seen)
     assert first.probabilities.tobytes() == second.probabilities.tobytes()
     for a, b in zip(first.objects, second.objects, strict=True):
-        assert a.probability == b.probability and a.alternatives == b.alternatives
+        assert a.probability == b.probability and a.shares == b.shares
         assert a.evidence.features().tobytes() == b.evidence.features().tobytes()
 
 

@@ -1,0 +1,396 @@
+"""Fits how sure the estimator says it is, and shows whether that is right: `python -m benchmarks.calibration FOLDER`.
+
+Renders two disjoint sets of cluttered scenes into FOLDER, estimates both from exact and from noisy boxes (kept there,
+so that a second call only fits), writes the constants of the first set to ``stages/perception/calibration.yaml`` and
+prints the reliability of the second.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+from scipy.optimize import minimize, minimize_scalar
+
+from benchmarks.datasets import Image, detections_file, images
+from benchmarks.estimate import Settings, estimates
+from benchmarks.pipeline import Estimate
+from stages.devices.clutter import write_clutter
+from stages.messages import Hypothesis, Observation, SceneEstimate
+from stages.perception.doubt import (
+    CONSTANTS,
+    FEATURES,
+    RIGHT_METRES,
+    RIGHT_RADIANS,
+    Calibration,
+    Evidence,
+    Judge,
+    Judged,
+    cost_of_an_object,
+    hypothesis_probabilities,
+    judged,
+)
+from stages.perception.likelihood import ObservedScene
+from stages.perception.metrics import pose_errors
+from stages.perception.refinement import Placed, RefinementSettings, SceneRefiner
+from stages.scene.catalogue import Catalogue, Floats
+
+_ROOT = Path(__file__).parents[1]
+_CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
+_PLOT = _ROOT / "docs" / "figures" / "reliability.png"
+_SEEDS = {"train": 1001, "test": 2002}
+"""Of the scenes; Clutter-15 has seed 0."""
+_POSE_SCALES = (20.0, 60.0, 180.0)
+_SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1), strict=True))
+"""Which way evidence points: a fit to few scenes must not turn it round."""
+_RIDGE = 1.0
+_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One estimated object."""
+
+    label: str
+    right: bool
+    """Within 2 cm and 15 degrees of the truth, modulo symmetries; False for an object that is not there."""
+    metres: float
+    radians: float
+    """Errors; 9 where the object is not there."""
+    evidence: dict[str, Evidence]
+    """By pose scale."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One estimated image."""
+
+    boxes: str
+    """``exact`` or ``noisy``."""
+    winner: int
+    winner_right: bool
+    """The winner's set of objects is the true one."""
+    true_hypothesis: int
+    """Index of the hypothesis with the true set; -1 where there is none."""
+    nat: float
+    """Metres times pixels that are one unit of :func:`hypothesis_probabilities`."""
+    log_weights: tuple[float, ...]
+    instances: tuple[Instance, ...]
+
+    def probabilities(self, scale: float) -> Floats:
+        """Of the hypotheses."""
+        return hypothesis_probabilities(np.array(self.log_weights), self.nat * scale)
+
+
+# ------------------------------------------------------------------------------------ what is fitted to
+
+
+class Recorder:
+    """Gathers the evidence of estimated images at several scales, and compares them with the truth."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._refiner = SceneRefiner(catalogue, RefinementSettings())
+        constants = Calibration.load()
+        self._judges = {
+            str(scale): Judge(catalogue, dof=6, calibration=replace(constants, pose_scale=scale, spread_scale=1.0))
+            for scale in _POSE_SCALES
+        }
+
+    def scene(self, image: Image, boxes: str, estimate: Estimate) -> Scene:
+        """One image, refined again to see what the refiner compared."""
+        (observation,) = (item for item in estimate.messages if isinstance(item, Observation))
+        ranked, *_ = (item for item in estimate.messages if isinstance(item, SceneEstimate))
+        scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+        placed = [Placed(item.label, item.T_camera_object) for item in ranked.objects]
+        refined = self._refiner.refine(scene, observation.rgb, placed)
+        doubted = [judged(*each) for each in zip(ranked.objects, refined.objects, strict=True)]
+        found = {scale: _evidence(judge, scene, doubted) for scale, judge in self._judges.items()}
+        instances = tuple(
+            self._instance(image, item.label, item.T_camera_object, {scale: found[scale][i] for scale in found})
+            for i, item in enumerate(doubted)
+        )
+        sets = _hypothesised(estimate)
+        true = sorted(self._name(truth.label) for truth in image.truths)
+        return Scene(
+            boxes=boxes,
+            winner=ranked.winner,
+            winner_right=sorted(item.label for item in ranked.objects) == true,
+            true_hypothesis=sets.index(true) if true in sets else -1,
+            nat=cost_of_an_object(scene, len(doubted)),
+            log_weights=tuple(ranked.log_weights.tolist()),
+            instances=instances,
+        )
+
+    def _instance(self, image: Image, label: str, T: Floats, evidence: dict[str, Evidence]) -> Instance:
+        item = self._catalogue[label]
+        truths = [truth.T_camera_object for truth in image.truths if truth.label == item.label]
+        whole = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
+        errors = [pose_errors(whole, truth, item.symmetries.transforms()) for truth in truths]
+        metres, radians = min(errors, key=lambda e: e[0] / RIGHT_METRES + e[1] / RIGHT_RADIANS, default=(9.0, 9.0))
+        return Instance(label, metres < RIGHT_METRES and radians < RIGHT_RADIANS, metres, radians, evidence)
+
+    def _name(self, number: int) -> str:
+        return next(item.name for item in self._catalogue.objects.values() if item.label == number)
+
+
+def _evidence(judge: Judge, scene: ObservedScene, doubted: Sequence[Judged]) -> list[Evidence]:
+    return [evidence for evidence, _ in judge.evidence(scene, doubted, judge.layers(scene, doubted), 0.5)]
+
+
+def _hypothesised(estimate: Estimate) -> list[list[str]]:
+    """The labels of each hypothesis, sorted, in the order of their weights."""
+    found = sorted((item for item in estimate.messages if isinstance(item, Hypothesis)), key=lambda item: item.index)
+    return [sorted(candidate.label for candidate in item.candidates) for item in found]
+
+
+def scenes(folder: Path, name: str, counts: dict[str, int], processes: int) -> list[Scene]:
+    """The estimated scenes of one set; estimated once and then read from ``folder``."""
+    found: list[Scene] = []
+    for boxes, count in counts.items():
+        path = folder / f"{name}-{boxes}.jsonl"
+        done = (
+            [msgspec.json.decode(line, type=Scene) for line in path.read_text().splitlines()] if path.is_file() else []
+        )
+        if len(done) < count:
+            done += _estimated(folder / name, boxes, range(len(done), count), path, processes)
+        found += done[:count]
+    return found
+
+
+def _estimated(dataset: Path, boxes: str, wanted: range, path: Path, processes: int) -> list[Scene]:
+    chosen = [image for image in images(dataset, detections_file(dataset, boxes)) if image.frame.index in wanted]
+    recorder = Recorder(Catalogue.load(dataset / "models"))
+    done: list[Scene] = []
+    for image, estimate in zip(chosen, estimates(dataset, chosen, Settings(processes=processes)), strict=True):
+        done.append(recorder.scene(image, boxes, estimate))
+        with path.open("a") as file:
+            file.write(msgspec.json.encode(done[-1]).decode() + "\n")
+        wrong = sum(not item.right for item in done[-1].instances)
+        print(f"{path.stem} {image.frame.name}: {wrong} of {len(done[-1].instances)} wrong", flush=True)
+    return done
+
+
+# ------------------------------------------------------------------------------------ the fit
+
+
+def fit(train: Sequence[Scene]) -> Calibration:
+    """Constants of greatest likelihood; the pose scale is the best of a few."""
+    hypothesis = _fit_hypotheses(train)
+    fits = [_fit_poses(train, hypothesis, scale) for scale in _POSE_SCALES]
+    for scale, (_, loss) in zip(_POSE_SCALES, fits, strict=True):
+        print(f"pose scale {scale:5.0f}: log loss {loss:.4f}")
+    return min(fits, key=lambda each: each[1])[0]
+
+
+def _fit_hypotheses(train: Sequence[Scene]) -> float:
+    """The scale at which the true set of objects is most likely, where it is among several."""
+    doubtful = [scene for scene in train if len(scene.log_weights) > 1 and scene.true_hypothesis >= 0]
+
+    def loss(log_scale: float) -> float:
+        chosen = [scene.probabilities(np.exp(log_scale))[scene.true_hypothesis] for scene in doubtful]
+        # A scale that makes every scene certain is not to be learnt from a few scenes that are all right.
+        return float(-np.log(np.maximum(chosen, 1e-12)).sum() + 0.1 * (log_scale - np.log(0.1)) ** 2)
+
+    found: Any = minimize_scalar(loss, bounds=(np.log(1e-3), np.log(3.0)), method="bounded")
+    return float(np.exp(found.x))
+
+
+def _fit_poses(train: Sequence[Scene], hypothesis: float, scale: float) -> tuple[Calibration, float]:
+    """Logistic regression with a small ridge; every weight keeps the sign that its evidence has."""
+    X, right = design(train, hypothesis, scale)
+    centres, scales = X.mean(0), np.maximum(X.std(0), 1e-3)
+    Z = (X - centres) / scales
+    signs = np.array([_SIGNS[name] for name in FEATURES])
+
+    def loss(parameters: Floats) -> tuple[float, Floats]:
+        logits = parameters[0] + (Z * parameters[1:]).sum(1)
+        residual = 1 / (1 + np.exp(-logits)) - right
+        value = np.logaddexp(0.0, np.where(right, -logits, logits)).sum() + 0.5 * _RIDGE * (parameters[1:] ** 2).sum()
+        return float(value), np.append(residual.sum(), (Z * residual[:, None]).sum(0) + _RIDGE * parameters[1:])
+
+    bounds = [(None, None), *((0, None) if sign > 0 else (None, 0) for sign in signs)]
+    found = minimize(loss, np.zeros(1 + len(FEATURES)), jac=True, bounds=bounds, method="L-BFGS-B")
+    weights = found.x[1:]
+    constants = Calibration(
+        hypothesis_scale=hypothesis,
+        pose_scale=scale,
+        spread_scale=_fit_spread(train, scale),
+        bias=float(found.x[0]),
+        weights=tuple(weights.tolist()),
+        centres=tuple(centres.tolist()),
+        scales=tuple(scales.tolist()),
+    )
+    return constants, float(found.fun) / len(right)
+
+
+def _fit_spread(train: Sequence[Scene], scale: float) -> float:
+    """The factor that makes the median error of right poses what it is for a normal distribution of that spread."""
+    ratios = [
+        item.metres / item.evidence[str(scale)].spread_metres
+        for scene in train
+        for item in scene.instances
+        if item.right
+    ]
+    return float(np.median(ratios)) / 0.888
+
+
+def design(chosen: Sequence[Scene], hypothesis: float, scale: float) -> tuple[Floats, np.ndarray[Any, np.dtype[Any]]]:
+    """Features of every instance, N x F, and whether it is right."""
+    rows = [
+        replace(item.evidence[str(scale)], hypothesis=float(scene.probabilities(hypothesis)[scene.winner])).features()
+        for scene in chosen
+        for item in scene.instances
+    ]
+    return np.array(rows), np.array([item.right for scene in chosen for item in scene.instances])
+
+
+# ------------------------------------------------------------------------------------ the evaluation
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Estimates that were called about equally sure."""
+
+    low: float
+    high: float
+    called: float
+    """Mean probability."""
+    right: int
+    count: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the share that is right."""
+        return wilson(self.right, self.count)
+
+
+def wilson(right: int, count: int) -> tuple[float, float]:
+    """Score interval of a share, 95 % (Wilson 1927)."""
+    z = 1.959964
+    share, n = right / count, count
+    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+
+
+def reliability(called: Floats, right: Floats) -> list[Bin]:
+    """Bins that hold something."""
+    found: list[Bin] = []
+    for low, high in pairwise(_BINS):
+        inside = (called >= low) & ((called < high) | (high == 1.0))
+        if inside.any():
+            found.append(Bin(low, high, float(called[inside].mean()), int(right[inside].sum()), int(inside.sum())))
+    return found
+
+
+def expected_error(bins: Sequence[Bin]) -> float:
+    """Expected calibration error: mean distance of what was called and what was right, by count."""
+    total = sum(each.count for each in bins)
+    return sum(each.count * abs(each.called - each.right / each.count) for each in bins) / total
+
+
+def table(bins: Sequence[Bin]) -> str:
+    """The reliability of all bins."""
+    lines = ["called        mean   right              95 % interval"]
+    for each in bins:
+        low, high = each.interval
+        lines.append(
+            f"{each.low:4.2f} to {each.high:4.2f}  {each.called:5.3f}  {each.right / each.count:5.3f} "
+            f"({each.right:3d} of {each.count:3d})  {low:5.3f} to {high:5.3f}"
+        )
+    return "\n".join([*lines, f"expected calibration error {expected_error(bins):.3f}"])
+
+
+def evaluate(test: Sequence[Scene], constants: Calibration) -> list[Bin]:
+    """Prints what the constants are worth on scenes that they were not fitted to."""
+    X, right = design(test, constants.hypothesis_scale, constants.pose_scale)
+    called = np.array([constants.probability(row) for row in X])
+    bins = reliability(called, right)
+    print(f"\n{len(right)} objects in {len(test)} estimates, {right.mean():.1%} right\n{table(bins)}")
+    for name in ("exact", "noisy"):
+        chosen = np.array([scene.boxes == name for scene in test for _ in scene.instances])
+        if chosen.any():
+            print(f"{name} boxes: called {called[chosen].mean():.3f}, right {right[chosen].mean():.3f}")
+    order = np.argsort(called)[: max(1, len(called) // 10)]
+    print(f"the least sure tenth holds {np.sum(~right[order])} of {np.sum(~right)} errors")
+    several = [scene for scene in test if len(scene.log_weights) > 1]
+    if several:
+        sure = [float(scene.probabilities(constants.hypothesis_scale)[scene.winner]) for scene in several]
+        print(f"winning hypotheses: called {np.mean(sure):.3f}, "
+              f"right {np.mean([scene.winner_right for scene in several]):.3f} of {len(several)}")  # fmt: skip
+    return bins
+
+
+def plot(bins: Sequence[Bin], path: Path) -> None:
+    """The reliability diagram."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5.2, 5.0), layout="constrained")
+    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfect")
+    axes.axvspan(0.85, 0.95, color="0.93", zorder=0)
+    called = [each.called for each in bins]
+    right = np.array([each.right / each.count for each in bins])
+    ends = np.array([each.interval for each in bins]).T
+    axes.errorbar(called, right, yerr=np.abs(ends - right), fmt="o", color="#2c6fbb", capsize=3, label="test scenes")
+    for each, x, y in zip(bins, called, right, strict=True):
+        axes.annotate(str(each.count), (x, y), textcoords="offset points", xytext=(7, -11), fontsize=8, color="0.35")
+    axes.set(xlabel="probability that was reported", ylabel="share within 2 cm and 15 degrees", xlim=(0, 1.02),
+             ylim=(0, 1.02), title="Reliability of poses (numbers: objects)")  # fmt: skip
+    axes.legend(loc="upper left", frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def write_constants(constants: Calibration, path: Path, command: str) -> None:
+    """Writes the constants with the command that made them."""
+    content = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(constants).items()}
+    rounded = {key: [float(f"{v:.4g}") for v in value] if isinstance(value, list) else float(f"{value:.4g}")
+               for key, value in content.items()}  # fmt: skip
+    features = ", ".join(FEATURES)
+    head = f"# Written by `{command}`. Weights are of the features\n# {features}.\n"
+    path.write_text(head + yaml.safe_dump(rounded, sort_keys=False, default_flow_style=None, width=110))
+
+
+def generate(folder: Path, name: str, count: int) -> None:
+    """Renders a set of scenes, unless it is there."""
+    if not (folder / name / "detections_noisy.json").is_file():
+        print(f"rendering {count} {name} scenes", flush=True)
+        write_clutter(folder / name, Catalogue.load(_CATALOGUE), scenes=count, seed=_SEEDS[name])
+
+
+def main() -> None:
+    """Fits and evaluates."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="where scenes and estimates are kept; empty it to begin anew")
+    parser.add_argument("--exact", type=int, default=40, help="scenes of each set estimated from exact boxes")
+    parser.add_argument("--noisy", type=int, default=20, help="scenes of each set estimated from noisy boxes")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--evaluate", action="store_true", help="keep the constants that are there")
+    options = parser.parse_args()
+    counts = {"exact": options.exact, "noisy": options.noisy}
+    sets = ("test",) if options.evaluate else ("train", "test")
+    for name in sets:
+        generate(options.folder, name, max(counts.values()))
+    found = {name: scenes(options.folder, name, counts, options.processes) for name in sets}
+    if not options.evaluate:
+        command = f"python -m benchmarks.calibration FOLDER --exact {options.exact} --noisy {options.noisy}"
+        write_constants(fit(found["train"]), CONSTANTS, command)
+        Calibration.load.cache_clear()
+        evaluate(found["train"], Calibration.load())
+    plot(evaluate(found["test"], Calibration.load()), _PLOT)
+
+
+if __name__ == "__main__":
+    main()
