@@ -1,0 +1,11 @@
+"""Competitors of the estimator by name, run on the same preprocessed images, boxes and catalogue."""
+
+from __future__ import annotations
+
+from benchmarks.baselines import icp, random_guess
+from benchmarks.baselines.common import Estimator
+
+METHODS: dict[str, Estimator] = {
+    "icp": icp.estimate,
+    "random": random_guess.estimate,
+}

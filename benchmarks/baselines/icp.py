@@ -1,0 +1,91 @@
+"""Multi-start ICP: point-to-plane from 12 yaws of 6 resting faces in each box, best by rendered-depth agreement.
+
+The starts put the middle of the side that the object shows at the box's median depth (Besl and McKay 1992; Chen and
+Medioni 1992 for the distance to the plane). The gate of ICP falls from 10 cm to 1.5 cm while points of the model seek
+readings; the best twelve are refined with all readings seeking the model, the gate falling to 6 mm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.baselines.common import Box, PerBox, untrained
+from benchmarks.baselines.observed import Crop
+from benchmarks.baselines.registration import Grid, Model, directions, model_to_readings, readings_to_model, thinned
+from stages.perception.poses import exp_so3
+from stages.scene.catalogue import Floats
+
+_YAWS = 12
+_COARSE = np.linspace(0.1, 0.015, 16)
+_FINE = np.linspace(0.015, 0.006, 20)
+"""Gates, metres."""
+_SOUGHT = 3000
+_SEEKING = 500
+"""Readings and model points of the coarse iterations."""
+_READINGS = 1500
+"""Readings of the fine iterations."""
+_LEADERS = 12
+
+
+def poses(box: Box, trained: None = None) -> Floats:
+    """Poses of one candidate, best first, K x 4 x 4; empty where the box holds hardly any readings."""
+    del trained
+    return best(box, starts(box)) if len(box.observed.inside(box.candidate)) >= 10 else np.zeros((0, 4, 4))
+
+
+def best(box: Box, begin: Floats) -> Floats:
+    """Starts (P x 4 x 4) after ICP, the leaders best first by rendered-depth agreement."""
+    readings = box.observed.inside(box.candidate)
+    scene = Grid.of(thinned(readings, _SOUGHT), voxel=0.008, margin=0.05)
+    basis = directions(box.dof, box.observed.T_camera_table)
+    coarse = model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING)
+    return refined(box, Crop.around(box.observed, box.candidate, 4).ranked(box.model.soup, coarse)[:_LEADERS])
+
+
+def refined(box: Box, begin: Floats) -> Floats:
+    """Poses that are nearly right (P x 4 x 4) after fine ICP, best first."""
+    readings = thinned(box.observed.inside(box.candidate), _READINGS)
+    basis = directions(box.dof, box.observed.T_camera_table)
+    fine = readings_to_model(box.model, readings, begin, _FINE, basis)
+    return Crop.around(box.observed, box.candidate, 2).ranked(box.model.soup, fine)
+
+
+def starts(box: Box) -> Floats:
+    """Every yaw of every face the object may rest on, the side it shows at the box's median depth, P x 4 x 4."""
+    view, T_camera_table = box.observed.view, box.observed.T_camera_table
+    middle = (box.candidate.box[:2] + box.candidate.box[2:]) / 2
+    ray = np.array([(middle[0] - view.cx) / view.fx, (middle[1] - view.cy) / view.fy, 1.0])
+    target = ray * np.median(box.observed.inside(box.candidate)[:, 2])
+    turns = rotations(T_camera_table, box.dof, _YAWS)
+    begin = np.tile(np.eye(4), (len(turns), 1, 1))
+    begin[:, :3, :3] = turns
+    for T in begin:
+        T[:3, 3] = target - T[:3, :3] @ _shown(box.model, ray @ T[:3, :3])
+    return on_plane(begin, box.model, T_camera_table) if box.dof == 3 else begin
+
+
+def rotations(T_camera_table: Floats, dof: int, yaws: int) -> Floats:
+    """Orientations of an object that rests on one of its six faces (upright with 3 degrees of freedom), P x 3 x 3."""
+    tips: Floats = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
+    faces = exp_so3(np.pi / 2 * tips[: 1 if dof == 3 else 6])
+    turns = exp_so3(np.arange(yaws)[:, None] * (2 * np.pi / yaws) * np.array([0.0, 0.0, 1.0]))
+    return np.concatenate([T_camera_table[:3, :3] @ turns @ face for face in faces])
+
+
+def on_plane(begin: Floats, model: Model, T_camera_table: Floats) -> Floats:
+    """Poses (P x 4 x 4) moved along the plane's normal until their lowest points touch it."""
+    normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
+    put = begin.copy()
+    for T in put:
+        lowest = (model.points @ (normal @ T[:3, :3])).min()
+        T[:3, 3] -= normal * (lowest + normal @ (T[:3, 3] - origin))
+    return put
+
+
+def _shown(model: Model, ray: Floats) -> Floats:
+    """Middle of the surface that faces a camera which looks along ``ray``; object frame."""
+    facing = model.normals @ ray < 0
+    return model.points[facing].mean(0) if facing.any() else model.centre
+
+
+estimate = PerBox(poses, untrained)
