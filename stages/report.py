@@ -19,6 +19,7 @@ from stages.messages import (
 from stages.perception.scoring import errors
 from stages.scene.catalogue import Catalogue
 from stages.scene.episode import Episode, Look, markdown, plain, title
+from stages.scene.text import certainty
 
 
 class Report(Stage):
@@ -61,6 +62,7 @@ class Report(Stage):
             left_out=scene_estimate.left_out,
             scene=scene_graph,
             errors=errors(snapshot.names, snapshot.T_base_objects, scene_graph.objects, self._catalogue),
+            certainty=certainty(scene_estimate),
         )
         self._looks.append((ctx.time_ns, look))
         return self._finish(ctx)

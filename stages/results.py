@@ -10,6 +10,7 @@ from runner.contract import Context, Finished, Refused, Stage
 from stages.devices.bop_results import HEADER, Result, write_scene_graph
 from stages.messages import Frame, SceneEstimate, SceneGraph
 from stages.scene.catalogue import Catalogue
+from stages.scene.text import certainty
 
 
 class BopResults(Stage):
@@ -58,7 +59,7 @@ class BopResults(Stage):
         names = ", ".join(item.name for item in scene_estimate.objects) or "no objects"
         ctx.log(
             f"{frame.name or frame.image_id}: {names} (hypothesis {scene_estimate.winner + 1} of "
-            f"{len(scene_estimate.log_weights)}{f', {seconds:.1f} s' if seconds > 0 else ''})"
+            f"{len(scene_estimate.log_weights)}{f', {seconds:.1f} s' if seconds > 0 else ''}{_said(scene_estimate)})"
         )
         if self._written == frame.total:
             return Finished(code=0, reason=f"{self._written} images, results in {self._path}")
@@ -68,3 +69,8 @@ class BopResults(Stage):
         """Wall time since the image before, -1 for the first: images overlap, so this is the time each one adds."""
         before, self._newest = self._newest, time.monotonic()
         return -1.0 if before is None else self._newest - before
+
+
+def _said(estimate: SceneEstimate) -> str:
+    text = certainty(estimate)
+    return f", {text}" if text else ""

@@ -60,7 +60,7 @@ from stages.perception.camera_model import back_project
 from stages.perception.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue, Floats, Mesh
 from stages.scene.relations import TABLE
-from stages.scene.text import support
+from stages.scene.text import SURE, support
 
 MOTION_FRAMES = 8
 """Postures shown of one robot motion."""
@@ -69,8 +69,8 @@ TABLE_SIZE = (0.7, 1.1)
 NODE_SPACING = (130.0, 110.0)
 """Pixels between the nodes of a scene graph, across and down."""
 GHOST_TRIANGLES = 80
-SURE, UNSURE = 0.9, 0.5
-"""Probabilities from which an object is drawn as sure and below which as unsure."""
+UNSURE = 0.5
+"""Probability below which an object is drawn in red."""
 _GREY: Color = (128, 128, 128)
 _BLUE: Color = (86, 156, 214)
 _GREEN: Color = (106, 190, 120)

@@ -34,8 +34,10 @@ class Result:
 
     @staticmethod
     def of(estimate: SceneEstimate, item: ObjectPose, label: int, seconds: float) -> Result:
-        """The result of one object of a scene."""
-        return Result(estimate.scene_id, estimate.image_id, label, item.confidence, item.T_camera_object, seconds)
+        """The result of one object of a scene; its score is the probability that the pose is right, where it was
+        judged, and the detector's confidence otherwise."""
+        score = item.confidence if item.probability is None else item.probability
+        return Result(estimate.scene_id, estimate.image_id, label, score, item.T_camera_object, seconds)
 
     def line(self) -> str:
         """The line of the CSV, without its end."""

@@ -26,6 +26,8 @@ class Look:
     left_out: int
     scene: SceneGraph
     errors: tuple[ObjectError, ...]
+    certainty: str = ""
+    """How sure perception said it was."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +163,8 @@ def _perception(looks: Sequence[Look]) -> list[str]:
         ]
         for look in looks
     ]
-    return table(header, rows, right=(1, 2, 3, 4, 5)) if rows else ["no scene was perceived"]
+    said = [_clip(f"{look.purpose}: {look.certainty}", WIDTH - 2) for look in looks if look.certainty]
+    return [*table(header, rows, right=(1, 2, 3, 4, 5)), *said] if rows else ["no scene was perceived"]
 
 
 def _middle_and_worst(values: Sequence[float], unit: str) -> str:

@@ -2,8 +2,24 @@
 
 from __future__ import annotations
 
-from stages.messages import SceneGraph
+from stages.messages import SceneEstimate, SceneGraph
 from stages.scene.relations import TABLE
+
+SURE = 0.9
+"""Probability from which an object's pose is called sure."""
+
+
+def certainty(estimate: SceneEstimate) -> str:
+    """How sure a scene is, in one line; empty where it was not judged."""
+    judged = sorted((item.probability, item.name) for item in estimate.objects if item.probability is not None)
+    if estimate.probabilities is None:
+        return ""
+    parts = [f"sure of {sum(p >= SURE for p, _ in judged)} of {len(judged)} objects"]
+    parts += [f"least sure: {name} {p:.2f}" for p, name in judged[:1]]
+    contradicted = [item.name for item in estimate.objects if item.contradicted]
+    parts += [f"contradicted: {', '.join(contradicted)}"] if contradicted else []
+    parts += [f"unknown: {len(estimate.unknown)}"] if estimate.unknown else []
+    return "; ".join(parts)
 
 
 def support(scene: SceneGraph) -> dict[str, tuple[str, str]]:
