@@ -144,7 +144,8 @@ def screen_bounds(corners, m, view):
         clear = clear and _f(0) < q <= nearest
     if not clear:
         return view[4] + _f(1), _f(0), _f(0), _f(0)
-    return (max(_f(0), ceil(u0)), max(_f(0), ceil(v0)),
+    # What lies to the right of the view must not be taken for what is too near.
+    return (min(view[4], max(_f(0), ceil(u0))), max(_f(0), ceil(v0)),
             min(view[4] - _f(1), floor(u1)), min(view[5] - _f(1), floor(v1)))  # fmt: skip
 
 
