@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from runner.contract import Refused
 from stages.perception.evaluators import Device
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window, credits
 from stages.perception.proposals import Dof, Guess, Proposals, distinct_best
-from stages.perception.rasteriser import Float32s
+from stages.perception.rasteriser import KERNEL, Float32s
 from stages.scene.catalogue import CatalogueObject, Floats
 
 Rectangle = tuple[int, int, int, int]
@@ -31,6 +32,8 @@ class FilterSettings:
     """How one hypothesis is estimated. Every improvement over the paper's plain form can be switched off alone."""
 
     particles: int = 625
+    fine_particles: int | None = 80
+    """Particles left at the end: their number falls geometrically with the annealing; None keeps all of them."""
     iterations: int = 400
     """For all objects of a hypothesis together."""
     dof: Dof = 6
@@ -88,6 +91,12 @@ class FilterSettings:
             settings = replace(settings, cost=form, **changes)
         return settings
 
+    def count(self, progress: float) -> int:
+        """Particles at a progress of the annealing between 0 and 1."""
+        if self.fine_particles is None:
+            return self.particles
+        return round(self.particles ** (1 - progress) * min(self.fine_particles, self.particles) ** progress)
+
     @staticmethod
     def paper(*, particles: int = 625, iterations: int = 400, dof: Dof = 6) -> FilterSettings:
         """The paper's plain form: every improvement is switched off."""
@@ -110,6 +119,7 @@ IMPROVEMENTS: dict[str, dict[str, Any]] = {
     "contact": {"cost": {"contact_slack": 100.0}, "contact": False},
     "overdraw": {"overdraw": 0},
     "early stop": {"schedule": None},
+    "tapering": {"fine_particles": None},
     "colour": {"colour": False},
 }
 """What each improvement over the paper's plain form sets when it is switched off; ``cost`` are fields of CostForm."""
@@ -278,7 +288,7 @@ class _Population:
 
     def _next(self, poses: Floats, costs: Floats, champion: Floats, phase: _Phase, progress: float) -> Floats:
         """Resampling and transition: equation 5, then the improvements that are switched on."""
-        settings, rng, count = self._settings, self._rng, self._settings.particles
+        settings, rng, count = self._settings, self._rng, self._settings.count(progress)
         metres = settings.metres[0] ** (1 - progress) * settings.metres[1] ** progress
         radians = settings.radians[0] ** (1 - progress) * settings.radians[1] ** progress
         chosen = poses[self._resampled(costs, count)]
@@ -301,7 +311,7 @@ class _Population:
 
     def _resampled(self, costs: Floats, count: int) -> NDArray[np.intp]:
         """Systematic resampling by the weights of equations 7 and 8."""
-        weights = _weights(costs, self._settings)
+        weights = _weights(costs, self._settings, count)
         positions = (self._rng.random() + np.arange(count)) / count
         return np.minimum(np.searchsorted(np.cumsum(weights), positions), len(costs) - 1)
 
@@ -317,18 +327,30 @@ class _Population:
         return Track(pose, cost, tuple(iterations), tuple(costs), positions)
 
 
-def _weights(costs: Floats, settings: FilterSettings) -> Floats:
+def _weights(costs: Floats, settings: FilterSettings, count: int) -> Floats:
     """Normalised weights exp(-lambda_r d); the scale is found by bisection where none is given."""
     excess = costs - costs.min()
     if settings.lambda_r is not None:
         return _normalised(np.exp(-settings.lambda_r * excess))
+    return _normalised(np.exp(-_scale(excess, settings.effective * count) * excess))
+
+
+@numba.njit(**KERNEL)
+def _scale(excess, effective):  # pyright: ignore[reportMissingParameterType]
+    """The scale at which as many of the weights exp(-scale excess) count: bisection of its logarithm."""
     low, high = -12.0, 12.0
     for _ in range(24):
         middle = (low + high) / 2
-        weights = _normalised(np.exp(-np.exp(middle) * excess))
-        enough = 1.0 / (weights**2).sum() > settings.effective * settings.particles
-        low, high = (middle, high) if enough else (low, middle)
-    return _normalised(np.exp(-np.exp(low) * excess))
+        scale, total, squares = np.exp(middle), 0.0, 0.0
+        for i in range(excess.shape[0]):
+            weight = np.exp(-scale * excess[i])
+            total += weight
+            squares += weight * weight
+        if total * total > effective * squares:
+            low = middle
+        else:
+            high = middle
+    return np.exp(low)
 
 
 def _normalised(weights: Floats) -> Floats:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from stages.perception.poses import (
     compose,
@@ -14,9 +16,9 @@ from stages.perception.poses import (
     exp_so3,
     random_rotations,
     rotate,
-    rotation_angle,
     symmetry_angle,
 )
+from stages.perception.rasteriser import KERNEL
 from stages.scene.catalogue import CatalogueObject, Floats
 
 Dof = Literal[3, 6]
@@ -41,6 +43,7 @@ class Proposals:
         self.dof: Dof = dof
         self._centre = item.bounds.mean(0)
         self._vertices = item.simplified(500).vertices
+        self._support = self._vertices[ConvexHull(self._vertices).vertices]
         # The catalogue's z axis is up when an object stands; resting poses of scanned meshes may lean a little.
         self._resting = np.eye(3)[None] if dof == 3 else np.stack([np.eye(3), *item.resting])
         self._symmetries = item.symmetries.transforms()
@@ -54,14 +57,14 @@ class Proposals:
         readings = guess.points[rng.integers(len(guess.points), size=count)]
         facing = self._facing_points(rotations, readings, rng)
         poses = np.concatenate([rotations, (readings - facing)[..., None]], -1)
-        return _put_down(poses, resting, self._vertices, guess.T_camera_table)
+        return _put_down(poses, resting, self._support, guess.T_camera_table)
 
     def uniform(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
         """The paper's first guesses: any orientation, the centre at a reading inside the box."""
         rotations, resting = self._rotations(guess, count, rng, resting_share=float(self.dof == 3))
         readings = guess.points[rng.integers(len(guess.points), size=count)]
         poses = np.concatenate([rotations, (readings - rotate(rotations, self._centre))[..., None]], -1)
-        return _put_down(poses, resting, self._vertices, guess.T_camera_table)
+        return _put_down(poses, resting, self._support, guess.T_camera_table)
 
     def directions(self, T_camera_table: Floats) -> Floats:
         """The twists (rotation about the centre, translation; camera frame) the object may make, 6 x dof."""
@@ -142,26 +145,44 @@ class Proposals:
         return nearest + rotate(rotations, self._centre)
 
 
-def _put_down(poses: Floats, resting: NDArray[np.bool_], vertices: Floats, T_camera_table: Floats) -> Floats:
+def _put_down(poses: Floats, resting: NDArray[np.bool_], support: Floats, T_camera_table: Floats) -> Floats:
     """Lifts or lowers poses until the lowest vertex touches the plane, where ``resting``."""
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
-    slopes = (poses[:, :, :3] * normal[:, None]).sum(1)
-    lowest = (slopes[:, None, :] * vertices[None]).sum(-1).min(1)
-    height = lowest + ((poses[:, :, 3] - origin) * normal).sum(1)
     put = poses.copy()
-    put[:, :, 3] -= np.where(resting, height, 0.0)[:, None] * normal
+    lying = put[resting]
+    slopes = (lying[:, :, :3] * normal[:, None]).sum(1)
+    lowest = (slopes[:, None, :] * support[None]).sum(-1).min(1)
+    height = lowest + ((lying[:, :, 3] - origin) * normal).sum(1)
+    put[resting, :, 3] -= height[:, None] * normal
     return put
 
 
 def distinct_best(poses: Floats, costs: Floats, count: int, *, metres: float, radians: float) -> NDArray[np.intp]:
     """Indices of up to ``count`` cheap poses, best first, no two of which are close in both position and angle."""
-    kept: list[int] = []
-    for i in np.argsort(costs, kind="stable"):
-        near = poses[kept]
-        apart = np.sqrt(((near[:, :, 3] - poses[i, :, 3]) ** 2).sum(1)) > metres
-        apart |= rotation_angle(near[:, :, :3], poses[i, :, :3]) > radians
-        if bool(apart.all()):
-            kept.append(int(i))
-        if len(kept) == count:
-            break
-    return np.asarray(kept, np.intp)
+    # The squared chord of two rotations an angle apart: no arc is needed to compare.
+    chord = 8.0 * np.sin(min(radians, np.pi) / 2) ** 2
+    return _distinct(np.ascontiguousarray(poses), np.argsort(costs, kind="stable"), count, metres**2, chord)
+
+
+@numba.njit(**KERNEL)
+def _distinct(poses, order, count, squared_distance, squared_chord):  # pyright: ignore[reportMissingParameterType]
+    """Goes through poses P x 3 x 4 in order and keeps those that are far from all kept before."""
+    kept = np.empty(min(count, len(order)), np.intp)
+    found = 0
+    for i in order:
+        apart = True
+        for k in range(found):
+            distance, chord = 0.0, 0.0
+            for row in range(3):
+                distance += (poses[i, row, 3] - poses[kept[k], row, 3]) ** 2
+                for column in range(3):
+                    chord += (poses[i, row, column] - poses[kept[k], row, column]) ** 2
+            if distance <= squared_distance and chord <= squared_chord:
+                apart = False
+                break
+        if apart:
+            kept[found] = i
+            found += 1
+            if found == count:
+                break
+    return kept[:found]
