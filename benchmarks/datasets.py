@@ -109,6 +109,13 @@ def parse_ids(text: str) -> list[ImageId]:
         raise Refused(f"'{text}': images are a number (the first so many) or ids such as 1/0,2/0") from None
 
 
+def parse_wanted(text: str | None) -> list[ImageId] | int | None:
+    """The option ``--images``: nothing for all, a number for the first so many, or ids."""
+    if text is None or text.isdecimal():
+        return None if text is None else int(text)
+    return parse_ids(text)
+
+
 def _known(wanted: Iterable[ImageId], known: Collection[ImageId]) -> set[ImageId]:
     ids = set(wanted)
     for id in sorted(ids - set(known)):

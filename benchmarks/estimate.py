@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.accuracy import failures, right_sets, score, table
-from benchmarks.datasets import Image, ImageId, detections_file, images, parse_ids
+from benchmarks.datasets import Image, ImageId, detections_file, images, parse_wanted
 from benchmarks.pipeline import Done, Estimate, Pipeline, Step, Steps
 from runner.children import SINGLE_THREADED
 from runner.contract import Refused
@@ -191,7 +191,7 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 
 def _run(options: argparse.Namespace) -> int:
-    wanted = _wanted(options.images)
+    wanted = parse_wanted(options.images)
     chosen = list(images(options.dataset, detections_file(options.dataset, options.detections), wanted))
     catalogue = Catalogue.load(options.dataset / "models")
     found: list[Result] = []
@@ -207,12 +207,6 @@ def _run(options: argparse.Namespace) -> int:
     print(table(scores, right_sets(truths, found)))
     print(failures(scores, catalogue))
     return 0
-
-
-def _wanted(text: str | None) -> list[ImageId] | int | None:
-    if text is None or text.isdecimal():
-        return None if text is None else int(text)
-    return parse_ids(text)
 
 
 if __name__ == "__main__":
