@@ -100,18 +100,18 @@ def judge(
     *,
     paint: Paint,
     symmetries: Floats,
-    favourite: int,
 ) -> Verdict | None:
     """Which contender's colours the image shows; None where too little of the object is seen.
 
     ``rgb`` is H x W x 3 (sRGB), ``visible`` H x W: where all contenders can be seen. Each is compared at the best of
-    its exact ``symmetries`` (S x 4 x 4), of which depth knows nothing. The favourite stays where colour is not sure.
+    its exact ``symmetries`` (S x 4 x 4), of which depth knows nothing. The first, depth's favourite, stays where colour
+    is not sure.
     """
     rows, columns, stride = _compared(visible)
     if len(np.unique(_tiles(rows, columns, stride))) < _LEAST_TILES:
         return None
     image = smoothed_lab(rgb, stride)[rows, columns]
-    normals = surface_normals(contenders[favourite].layer, view)[rows, columns]
+    normals = surface_normals(contenders[0].layer, view)[rows, columns]
     rays = view.rays()[rows, columns]
     painted = np.stack([
         _best_painted(paint, symmetries, _object_points(each, rays, rows, columns), image, normals)
@@ -120,8 +120,8 @@ def judge(
     fits = distances(image, painted, normals)
     means = fits.mean(-1)
     best = int(np.argmin(means))
-    sure = _is_sure(fits[favourite] - fits[best], _tiles(rows, columns, stride))
-    return Verdict(best if sure else favourite, means)
+    sure = _is_sure(fits[0] - fits[best], _tiles(rows, columns, stride))
+    return Verdict(best if sure else 0, means)
 
 
 def cielab(rgb: NDArray[Any]) -> Floats:

@@ -28,8 +28,11 @@ _GAIN = 5e-6
 """Metres per visible pixel by which a moved object must lower the scene's cost."""
 _SAME = np.deg2rad(12.0)
 """Two poses closer than this, modulo symmetry, are one."""
+_ROUGH = 3
 _PROMISING = 6
-"""Flips that are polished in full."""
+_HOPE = 6.0
+"""Steps by which all flips are polished first, and how many are polished in full: only those whose cost then exceeds
+the present one's by less than so many times what counts as equal."""
 _YAW_STEP = np.deg2rad(15.0)
 """Between the turns about a continuous axis at which an object's colours are compared."""
 
@@ -169,6 +172,10 @@ class _Place:
     region: Rectangle
     likelihood: ObjectLikelihood
     directions: Floats
+    visible: float
+    """Pixels that show the object."""
+    equal: float
+    """Costs that differ by less are equal, metres times pixels."""
 
 
 class _Joint:
@@ -205,46 +212,49 @@ class _Joint:
         place, start = self._place(i), self._poses[i][None]
         moved = place.likelihood.refine(start, place.directions, steps=self._settings.steps, gate=self._settings.gate)
         before, after = self._totals(i, place, np.concatenate([start, moved])).tolist()
-        better = after < before - _GAIN * self._visible(i)
+        better = after < before - _GAIN * place.visible
         if better:
             self._move(i, moved[0])
         return better
 
     def _settle(self, i: int, rgb: NDArray[np.uint8]) -> bool:
         place = self._place(i)
-        poses, totals = self._flips(i, place)
-        equal = self._settings.equal * self._noise(i) * self._visible(i)
-        chosen = np.flatnonzero(totals <= totals.min() + equal)
-        favourite = self._favourite(i, totals[chosen])
-        verdict = self._verdict(i, place, poses[chosen], favourite, rgb) if len(chosen) > 1 else None
-        winner = favourite if verdict is None else verdict.winner
-        self._considered[i] = _considered(poses[chosen], totals[chosen], verdict, winner)
-        if chosen[winner] == 0:
-            return False
-        self._move(i, poses[chosen[winner]])
-        return True
+        poses, totals = self._equals(i, place)
+        verdict = self._verdict(i, place, poses, rgb) if len(poses) > 1 else None
+        winner = 0 if verdict is None else verdict.winner
+        self._considered[i] = _considered(poses, totals, verdict, winner)
+        turned = not np.array_equal(poses[winner], self._poses[i])
+        if turned:
+            self._move(i, poses[winner])
+        return turned
 
-    def _favourite(self, i: int, totals: Floats) -> int:
-        """The pose of least cost; the present one, which comes first, where it is hardly dearer."""
-        best = int(np.argmin(totals))
-        return 0 if totals[0] <= totals[best] + _GAIN * self._visible(i) else best
+    def _equals(self, i: int, place: _Place) -> tuple[Floats, Floats]:
+        """Depth's favourite, then the poses that depth finds equal to it, cheapest first, and what they cost.
 
-    def _flips(self, i: int, place: _Place) -> tuple[Floats, Floats]:
-        """The object's pose and those of its flips that fit best once polished, and the scene's cost with each.
-
-        No two are the same modulo the object's symmetries; the present pose comes first.
+        They are the present pose and its polished flips, no two the same modulo the object's symmetries. The present
+        one is the favourite where it is hardly dearer than the cheapest.
         """
-        model, settings = self._models[i], self._settings
-        flips = model.proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
-        rough = place.likelihood.refine(flips, place.directions, steps=3, gate=2 * settings.gate)
-        promising = rough[np.argsort(place.likelihood.costs(rough), kind="stable")[:_PROMISING]]
-        moved = place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
-        poses = np.concatenate([self._poses[i][None], moved])
-        totals = self._totals(i, place, poses)
-        kept = _distinct(poses, totals, model.symmetries)
+        flips = self._flips(i, place)
+        present = self._totals(i, place, self._poses[i][None])
+        flips = flips[place.likelihood.costs(flips) <= present[0] + place.equal]
+        poses = np.concatenate([self._poses[i][None], flips])
+        totals = np.concatenate([present, self._totals(i, place, flips)])
+        ranks = totals - _GAIN * place.visible * (np.arange(len(totals)) == 0)
+        kept = _distinct(poses, ranks, self._models[i].symmetries)
+        kept = [k for k in kept if totals[k] <= totals.min() + place.equal]
         return poses[kept], totals[kept]
 
-    def _verdict(self, i: int, place: _Place, poses: Floats, favourite: int, rgb: NDArray[np.uint8]) -> Verdict | None:
+    def _flips(self, i: int, place: _Place) -> Floats:
+        """Those of the object's flips that are worth a full polish, polished."""
+        settings = self._settings
+        flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
+        rough = place.likelihood.refine(flips, place.directions, steps=_ROUGH, gate=2 * settings.gate)
+        present, *costs = place.likelihood.costs(np.concatenate([self._poses[i][None], rough])).tolist()
+        order = np.argsort(costs, kind="stable")[:_PROMISING]
+        promising = rough[[k for k in order.tolist() if costs[k] < present + _HOPE * place.equal]]
+        return place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
+
+    def _verdict(self, i: int, place: _Place, poses: Floats, rgb: NDArray[np.uint8]) -> Verdict | None:
         if not self._settings.colour:
             return None
         x0, y0, x1, y1 = place.region
@@ -254,7 +264,7 @@ class _Joint:
         contenders = [Contender(*each) for each in zip(poses, layers, strict=True)]
         return judge(
             rgb[y0:y1, x0:x1], window.view, visible, contenders,
-            paint=model.paint, symmetries=model.symmetries, favourite=favourite,
+            paint=model.paint, symmetries=model.symmetries,
         )  # fmt: skip
 
     def _place(self, i: int) -> _Place:
@@ -268,8 +278,12 @@ class _Joint:
         background = np.maximum.reduce([scene.plane_inverse, *others])
         everything = (0, 0, x1 - x0, y1 - y0)
         window = Window.of(scene, background, everything, everything, stride=1, form=self._settings.cost)
+        likelihood = ObjectLikelihood(self._models[i].shape, window, scene, self._settings.cost)
+        layer = self._layers[i][y0:y1, x0:x1]
+        cost, share = fit(scene, layer, background, self._settings.cost)
+        visible = float(share * (layer > 0).sum())
         directions = self._models[i].proposals.directions(scene.T_camera_table)
-        return _Place(region, ObjectLikelihood(self._models[i].shape, window, scene, self._settings.cost), directions)
+        return _Place(region, likelihood, directions, visible, self._settings.equal * cost * visible)
 
     def _totals(self, i: int, place: _Place, poses: Floats) -> Floats:
         """What the scene costs with the object at each of the poses, up to a constant: depth and contact."""
@@ -284,19 +298,9 @@ class _Joint:
         return penalty(found, apparent(solids, poses, self._scene.view.fx))
 
     def _found(self, i: int) -> RefinedObject:
-        cost, visible = self._fit(i)
-        return RefinedObject(self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i])
-
-    def _noise(self, i: int) -> float:
-        return self._fit(i)[0]
-
-    def _visible(self, i: int) -> float:
-        """Pixels that show the object."""
-        return float(self._fit(i)[1] * (self._layers[i] > 0).sum())
-
-    def _fit(self, i: int) -> tuple[float, float]:
         others = [self._scene.plane_inverse, *(layer for j, layer in enumerate(self._layers) if j != i)]
-        return fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
+        cost, visible = fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
+        return RefinedObject(self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i])
 
     def _move(self, i: int, pose: Floats) -> None:
         self._poses[i] = pose
@@ -311,10 +315,10 @@ class _Joint:
         return i != j and a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _distinct(poses: Floats, totals: Floats, symmetries: Floats) -> list[int]:
-    """The first pose, then the others, cheapest first, without those that equal one before modulo symmetry."""
-    kept = [0]
-    for k in (1 + np.argsort(totals[1:], kind="stable")).tolist():
+def _distinct(poses: Floats, ranks: Floats, symmetries: Floats) -> list[int]:
+    """The poses by rank, without those that equal one before modulo symmetry."""
+    kept: list[int] = []
+    for k in np.argsort(ranks, kind="stable").tolist():
         if all(symmetry_angle(poses[j, :, :3], poses[k, :, :3], symmetries) > _SAME for j in kept):
             kept.append(k)
     return kept

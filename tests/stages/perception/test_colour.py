@@ -23,11 +23,14 @@ PAINT = Paint.of(CAN.mesh)
 
 
 def verdict(rgb: np.ndarray, *, favourite: int, paint: Paint = PAINT) -> Verdict | None:
+    """Standing is 0, turned is 1, whichever is depth's favourite."""
     layers = [inverse_depth(Soup.of(CAN.mesh), T, VIEW) for T in (STANDING, TURNED)]
     contenders = [Contender(T[:3], layer) for T, layer in zip((STANDING, TURNED), layers, strict=True)]
+    order = [favourite, 1 - favourite]
     visible = np.logical_and.reduce([layer > 0 for layer in layers])
     symmetries = CAN.symmetries.transforms(np.deg2rad(30))
-    return judge(rgb, VIEW, visible, contenders, paint=paint, symmetries=symmetries, favourite=favourite)
+    found = judge(rgb, VIEW, visible, [contenders[k] for k in order], paint=paint, symmetries=symmetries)
+    return None if found is None else Verdict(order[found.winner], found.distances[order])
 
 
 def test_cielab_agrees_with_opencv() -> None:
@@ -100,7 +103,7 @@ def test_a_few_pixels_decide_nothing() -> None:
     few = np.zeros(layer.shape, bool)
     few[80:88, 80:88] = True
     contenders = [Contender(STANDING[:3], layer)] * 2
-    assert judge(rgb, VIEW, few, contenders, paint=PAINT, symmetries=np.eye(4)[None], favourite=0) is None
+    assert judge(rgb, VIEW, few, contenders, paint=PAINT, symmetries=np.eye(4)[None]) is None
 
 
 def test_normals_of_a_plane() -> None:

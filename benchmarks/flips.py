@@ -1,0 +1,290 @@
+"""Flips before and after colour: `python -m benchmarks.flips [SET ...] [--data FOLDER] [--looks N]`.
+
+Every image is filtered once, with exact boxes. The ranked scene is then refined by depth alone, and with colour.
+An object is flipped where its shape lies right (ADD-S below 1 cm) and its rotation is wrong by more than 15 degrees,
+modulo its exact symmetries. Besides the data sets there are looks of the simulated robot at objects of its own
+catalogue, cans end up and end down among them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.accuracy import Score, score
+from benchmarks.datasets import Image, Truth, detections_file, images
+from benchmarks.estimate import Settings, estimates
+from runner.contract import Level
+from stages.camera import SimulatedCamera
+from stages.devices import fetch
+from stages.devices.bop_results import Result
+from stages.devices.clutter import write_models
+from stages.devices.tabletop import TABLE
+from stages.messages import Candidate, Candidates, ObjectPose, Observation, SceneEstimate, Snapshot
+from stages.perception.likelihood import ObservedScene
+from stages.perception.poses import exp_so3, inverse, pose
+from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.perception.refinement import Placed, RefinementSettings, SceneRefiner
+from stages.perception.renderer import Camera, Item, Renderer
+from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+
+ROOT = Path(__file__).parents[1]
+CATALOGUE = ROOT / "stages" / "scene" / "catalogue.yaml"
+FIGURE = ROOT / "docs" / "figures" / "flips.png"
+OWN = "simulated looks"
+SETS = ("ycb-real", "clutter-ycb", "household-layout", OWN)
+_SHOWN = ("soup_can", "soup_can", "tuna_can", ("sauce_bottle", "water_bottle", "milk_carton"), ("tea_box", "sugar_box"))
+"""Objects of a look; of a tuple, one after the other."""
+_TURNED = np.deg2rad(15.0)
+_PLACES: list[tuple[float, float]] = [(x, y) for x in (0.58, 0.74) for y in (-0.22, 0.0, 0.22)]
+_TILE = 110
+_PAIRS = 10
+_Dof = Literal[3, 6]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One image, what is true in it, and its objects as ranked and as refined without and with colour."""
+
+    image: Image
+    ranked: tuple[Result, ...]
+    before: tuple[Result, ...]
+    after: tuple[Result, ...]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One true object and its scores: as ranked, refined by depth alone, and with colour."""
+
+    label: str
+    ranked: Score
+    before: Score
+    after: Score
+
+
+def is_flipped(one: Score) -> bool:
+    """The shape lies right, the object does not."""
+    return one.adds < 0.01 and one.radians > _TURNED
+
+
+def cases(models: Path, chosen: Iterable[Image], dof: _Dof) -> Iterator[Case]:
+    """Filters each image and refines the ranked scene with and without colour; ``models`` holds the data set."""
+    catalogue = Catalogue.load(models / "models")
+    refiners = [SceneRefiner(catalogue, RefinementSettings(dof=dof, colour=colour)) for colour in (False, True)]
+    chosen = list(chosen)
+    for image, found in zip(chosen, estimates(models, chosen, Settings(dof=dof)), strict=True):
+        (observation,) = [m for m in found.messages if isinstance(m, Observation)]
+        ranked = next(m for m in found.messages if isinstance(m, SceneEstimate))
+        before, after = (_refined(refiner, observation, ranked, catalogue) for refiner in refiners)
+        yield Case(image, _results(ranked, ranked.objects, catalogue), before, after)
+
+
+def _refined(
+    refiner: SceneRefiner, observation: Observation, ranked: SceneEstimate, catalogue: Catalogue
+) -> tuple[Result, ...]:
+    scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+    placed = [Placed(item.label, item.T_camera_object) for item in ranked.objects]
+    found = refiner.refine(scene, observation.rgb, placed).objects
+    moved = [
+        msgspec.structs.replace(item, T_camera_object=pose(new.T_camera_object[:, :3], new.T_camera_object[:, 3]))
+        for item, new in zip(ranked.objects, found, strict=True)
+    ]
+    return _results(ranked, moved, catalogue)
+
+
+def _results(scene: SceneEstimate, objects: Sequence[ObjectPose], catalogue: Catalogue) -> tuple[Result, ...]:
+    return tuple(Result.of(scene, item, catalogue[item.label].label, -1.0) for item in objects)
+
+
+def pairs(case: Case, catalogue: Catalogue) -> list[Pair]:
+    """The true objects of a case with their scores."""
+    names = {item.label: item.name for item in catalogue.objects.values()}
+    scored = [
+        score(list(case.image.truths), list(found), catalogue) for found in (case.ranked, case.before, case.after)
+    ]
+    return [Pair(names[each[0].truth.label], *each) for each in zip(*scored, strict=True)]
+
+
+# --- simulated looks --------------------------------------------------------------------------------------------
+
+
+def looks(catalogue: Catalogue, count: int) -> Iterator[Image]:
+    """What the simulated head camera sees of standing, inverted and lying objects, with boxes around each."""
+    camera = SimulatedCamera(SimulatedCamera.Config(catalogue=CATALOGUE))
+    for index in range(count):
+        rng = np.random.default_rng([7, index])
+        labels = [each if isinstance(each, str) else each[index % len(each)] for each in _SHOWN]
+        spots = rng.permutation(len(_PLACES))[: len(labels)]
+        poses = [_rested(catalogue[a], _PLACES[b], rng) for a, b in zip(labels, spots.tolist(), strict=True)]
+        yield _look(camera, catalogue, labels, poses, index)
+    camera.close()
+
+
+def _rested(item: CatalogueObject, place: tuple[float, float], rng: np.random.Generator) -> Floats:
+    """T_base_object on the table, resting in one of its ways, turned at random."""
+    R = exp_so3(np.array([0, 0, rng.uniform(-np.pi, np.pi)])) @ item.resting[rng.integers(len(item.resting))]
+    lowest = float((item.mesh.vertices @ R[2]).min())
+    x, y = np.array(place) + rng.uniform(-0.02, 0.02, 2)
+    return pose(R, np.array([x, y, TABLE.height - lowest]))
+
+
+def _look(
+    camera: SimulatedCamera, catalogue: Catalogue, labels: Sequence[str], poses: Sequence[Floats], index: int
+) -> Image:
+    snapshot = Snapshot(
+        names=tuple(labels),
+        T_base_objects=np.stack(poses),
+        joint_names=tuple(fetch.HOME),
+        joint_positions=np.array(list(fetch.HOME.values())),
+        time=0.0,
+    )
+    frame = camera.on_snapshot(snapshot, _Silent(np.random.default_rng([8, index])))
+    frame = msgspec.structs.replace(
+        frame, n_objects=len(labels), scene_id=index + 1, index=index, name=f"look {index + 1}"
+    )
+    assert frame.T_base_camera is not None
+    seen = [inverse(frame.T_base_camera) @ T for T in poses]
+    boxes = _boxes([(catalogue[label], T) for label, T in zip(labels, seen, strict=True)], View.of(frame.K, 640, 480))
+    found = tuple(Candidate(box=box, label=label, confidence=1.0) for box, label in zip(boxes, labels, strict=True))
+    candidates = Candidates(candidates=found, labels=tuple(catalogue.objects),
+                            confidences=np.zeros((len(found), len(catalogue.objects))))  # fmt: skip
+    truths = tuple(Truth((index + 1, 0), catalogue[label].label, T) for label, T in zip(labels, seen, strict=True))
+    return Image(frame, candidates, truths)
+
+
+def _boxes(items: Sequence[tuple[CatalogueObject, Floats]], view: View) -> list[Floats]:
+    """Boxes around what can be seen of each object."""
+    layers = [inverse_depth(Soup.of(item.mesh), T, view) for item, T in items]
+    nearest = np.maximum.reduce(layers)
+    shown = [np.nonzero((layer > 0) & (layer >= nearest)) for layer in layers]
+    return [np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float) for v, u in shown]
+
+
+@dataclass(frozen=True)
+class _Silent:
+    """A context for a stage that is called from here."""
+
+    rng: np.random.Generator
+    directory: Path = Path()
+    time_ns: int = 0
+
+    def log(self, text: str, *, level: Level = "info") -> None:
+        """Nobody listens."""
+
+
+# --- table and figure -------------------------------------------------------------------------------------------
+
+
+def table(found: dict[str, list[Pair]]) -> str:
+    """Flips by set and object, in Markdown."""
+    lines = [
+        "| set | object | instances | flipped as ranked | refined by depth | with colour |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, each in found.items():
+        labels = sorted({pair.label for pair in each if any(map(is_flipped, _stages(pair)))})
+        lines += [_row(name, label, [pair for pair in each if pair.label == label]) for label in labels]
+        lines.append(_row(name, "**all**", each))
+    return "\n".join(lines)
+
+
+def _row(name: str, label: str, each: list[Pair]) -> str:
+    counts = [sum(map(is_flipped, scores)) for scores in zip(*map(_stages, each), strict=True)]
+    return f"| {name} | {label} | {len(each)} | " + " | ".join(map(str, counts)) + " |"
+
+
+def _stages(pair: Pair) -> tuple[Score, Score, Score]:
+    return pair.ranked, pair.before, pair.after
+
+
+def sheet(shown: Sequence[tuple[Case, Pair]], catalogues: Sequence[Catalogue]) -> NDArray[np.uint8]:
+    """One column a pair: observation, as ranked, refined with colour."""
+    columns = [_column(case, pair, catalogue) for (case, pair), catalogue in zip(shown, catalogues, strict=True)]
+    return np.concatenate(columns, 1)
+
+
+def _column(case: Case, pair: Pair, catalogue: Catalogue) -> NDArray[np.uint8]:
+    frame = case.image.frame
+    item = next(each for each in catalogue.objects.values() if each.label == pair.before.truth.label)
+    drawn = [frame.rgb, *(_overlay(case.image, _nearest(found, pair), item) for found in (case.ranked, case.after))]
+    x0, y0, x1, y1 = _crop(pair, item, frame.K, frame.rgb.shape)
+    return np.concatenate([cv2.resize(each[y0:y1, x0:x1], (_TILE, _TILE)) for each in drawn], 0).astype(np.uint8)
+
+
+def _nearest(found: Sequence[Result], pair: Pair) -> Floats:
+    """The estimate of the pair's object."""
+    truth = pair.before.truth
+    poses = [each.T_camera_object for each in found if each.label == truth.label]
+    return min(poses, key=lambda T: float(np.linalg.norm(T[:3, 3] - truth.T_camera_object[:3, 3])))
+
+
+def _overlay(image: Image, T_camera_object: Floats, item: CatalogueObject) -> NDArray[np.uint8]:
+    """The observation in grey with one object, rendered, laid over it."""
+    height, width = image.depth.shape
+    renderer = Renderer(width, height)
+    rendered = renderer.color([Item(item.mesh, T_camera_object)], Camera(image.K, np.eye(4)))
+    renderer.close()
+    grey = np.repeat(image.rgb.mean(axis=2, keepdims=True), 3, axis=2)
+    return np.where(rendered.any(axis=2, keepdims=True), rendered, 0.7 * grey).astype(np.uint8)
+
+
+def _crop(pair: Pair, item: CatalogueObject, K: Floats, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """A square around the object, inside the image."""
+    centre = (pair.before.truth.T_camera_object @ np.append(item.bounds.mean(0), 1))[:3]
+    u, v = (K @ centre)[:2] / centre[2]
+    side = int(1.3 * np.linalg.norm(item.dimensions) * K[0, 0] / centre[2])
+    x0 = int(np.clip(u - side / 2, 0, max(0, shape[1] - side)))
+    y0 = int(np.clip(v - side / 2, 0, max(0, shape[0] - side)))
+    return x0, y0, x0 + side, y0 + side
+
+
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def _found(name: str, data: Path, count: int) -> tuple[Catalogue, list[Case]]:
+    if name != OWN:
+        chosen = images(data / name, detections_file(data / name, "exact"))
+        dof: _Dof = 3 if name == "household-layout" else 6
+        return Catalogue.load(data / name / "models"), list(cases(data / name, chosen, dof))
+    catalogue = Catalogue.load(CATALOGUE)
+    with tempfile.TemporaryDirectory() as folder:
+        write_models(Path(folder) / "models", catalogue)
+        return catalogue, list(cases(Path(folder), looks(catalogue, count), 6))
+
+
+def main() -> None:
+    """Prints the table and writes the figure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sets", nargs="*", default=list(SETS), help=f"of {', '.join(SETS)}")
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--looks", type=int, default=20)
+    parser.add_argument("--figure", type=Path, default=FIGURE)
+    options = parser.parse_args()
+    rows: dict[str, list[Pair]] = {}
+    shown: list[tuple[Case, Pair]] = []
+    catalogues: list[Catalogue] = []
+    for name in options.sets:
+        catalogue, found = _found(name, options.data, options.looks)
+        each = [(case, pair) for case in found for pair in pairs(case, catalogue)]
+        rows[name] = [pair for _, pair in each]
+        changed = [one for one in each if is_flipped(one[1].ranked) != is_flipped(one[1].after)]
+        shown += changed
+        catalogues += [catalogue] * len(changed)
+    print(table(rows))
+    if shown:
+        _write(options.figure, sheet(shown[:_PAIRS], catalogues[:_PAIRS]))
+
+
+if __name__ == "__main__":
+    main()
