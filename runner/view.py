@@ -115,6 +115,7 @@ def _stream(path: Path) -> rr.RecordingStream:
 def view_live(path: Path | None = None, *, folder: Path = Path("recordings")) -> None:
     """Shows a graph while it runs: ``path`` is its recording, by default the one in ``folder`` being written."""
     path = path or newest_live(folder)
+    os.nice(10)  # the graph comes first: drawing takes what it leaves
     port = _free_port()
     viewer = _start_viewer(port, "--expect-data-soon")
     try:

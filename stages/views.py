@@ -90,6 +90,8 @@ class Views:
             raise Refused(f"view: none of the stages {', '.join(configs)} has a setting `catalogue`; objects need one")
         self._catalogue = Catalogue.load(Path(paths[0]))
         self._colors = palette(list(self._catalogue.objects))
+        self._refined = configs.get("refiner", {}).get("form") == "default"
+        """A better estimate follows the ranker's."""
         self._frames: dict[tuple[int, int, str], Frame] = {}
         self._posteriors: deque[Posterior] = deque(maxlen=512)
         self._joints: dict[str, float] = {}
@@ -194,7 +196,7 @@ class Views:
         yield Text("look", look_text(estimate))
         yield from doubt_drawings(estimate, self._catalogue)
         frame = self._frames.get((estimate.scene_id, estimate.image_id, estimate.name))
-        if frame is not None:
+        if frame is not None and (estimate.probabilities is not None or not self._refined):
             yield Image("estimate/rgb", self._overlay(frame, estimate))
             yield doubt_boxes(estimate)
 
