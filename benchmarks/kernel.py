@@ -194,8 +194,8 @@ def _budget() -> None:
     stage.on_hypothesis(Hypothesis(index=0, count=1, candidates=candidates), observation, cast(Context, _Quiet()))
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"\npaper's full budget, four objects, 400 iterations of {PARTICLES}: {seconds:.1f} CPU s on one core")
-    print(f"peak memory of that process: {peak:.0f} MB")
+    print(f"paper's full budget, four objects, 400 iterations of {PARTICLES}: {seconds:.1f} CPU s on one core")
+    print(f"peak memory of that process: {peak:.0f} MB\n")
 
 
 def _processor() -> str:
@@ -214,22 +214,22 @@ def _one_core() -> None:
 
 
 def main() -> None:
-    """Prints the tables, then what a replica takes for the whole budget."""
+    """Prints what a replica takes for the whole budget, then the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--budget", action="store_true", help="only the whole budget, in this process")
     _one_core()
     if parser.parse_args().budget:
         _budget()
         return
+    print(f"{_processor()}, one core\n", flush=True)
+    # First, because a child's peak memory is no less than what its parent holds when it starts.
+    subprocess.run([sys.executable, "-m", "benchmarks.kernel", "--budget"], check=True)
     catalogue = Catalogue.load(CATALOGUE)
-    print(f"{_processor()}, one core")
     print(f"CPU ms per iteration of {PARTICLES} particles: median (least); last column: mean of medians over ours")
     print("* timed on fewer particles and scaled up")
     print(" " * 28 + "".join(f"{shape:>16s}" for shape in SHAPES) + f"{'x ours':>10s}")
     for width, triangles in SIZES:
         _compare(catalogue, width, triangles)
-    sys.stdout.flush()
-    subprocess.run([sys.executable, "-m", "benchmarks.kernel", "--budget"], check=True)
 
 
 if __name__ == "__main__":

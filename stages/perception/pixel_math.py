@@ -9,6 +9,8 @@ Every value is a float32 and every name is one that both compilers know, so that
 
 from __future__ import annotations
 
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -17,6 +19,14 @@ from numpy import ceil, floor
 
 NEAR = 0.05
 """Metres: nothing with a corner closer than this is rendered."""
+
+# The cache of compiled functions looks at their own file only, though they contain functions of the others: each state
+# of the sources has its own cache.
+_SOURCES = [Path(__file__).with_name(f"{name}.py").read_bytes() for name in ("pixel_math", "rasteriser", "kernels")]
+_CACHES: Any = numba.config
+_CACHES.CACHE_DIR = str(
+    Path(_CACHES.CACHE_DIR or Path(__file__).parent / "__pycache__") / sha256(b"".join(_SOURCES)).hexdigest()[:16]
+)
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning. No parallel reduction anywhere:
 # the bytes must not depend on how many threads a machine has.
