@@ -135,7 +135,8 @@ class Recorder:
         whole = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
         errors = [pose_errors(whole, truth, item.symmetries.transforms()) for truth in truths]
         metres, radians = min(errors, key=lambda e: e[0] / RIGHT_METRES + e[1] / RIGHT_RADIANS, default=(9.0, 9.0))
-        return Instance(label, metres < RIGHT_METRES and radians < RIGHT_RADIANS, metres, radians, evidence)
+        right = bool(metres < RIGHT_METRES and radians < RIGHT_RADIANS)
+        return Instance(label, right, float(metres), float(radians), evidence)
 
     def _name(self, number: int) -> str:
         return next(item.name for item in self._catalogue.objects.values() if item.label == number)

@@ -112,7 +112,7 @@ class Views:
         filters = Row(
             (
                 Panel("Best cost over iterations", "series", "cost"),
-                Tabs((Panel("Hypotheses: probability", "bars", "weights"), Panel("Look", "text", "look"))),
+                Tabs((Panel("Look", "text", "look"), Panel("Hypotheses: probability", "bars", "weights"))),
             )
         )
         world = Column(
@@ -172,10 +172,6 @@ class Views:
         for key in list(self._frames)[:-64]:
             del self._frames[key]
         yield Clear("camera/candidates")
-        yield Clear("world/camera/particles")
-        yield Clear("world/camera/doubt")
-        yield Clear("estimate/objects")
-        yield Clear("cost")
         yield Image("camera/rgb", frame.rgb)
         yield DepthImage("depth/image", frame.depth)
         if frame.T_base_camera is not None:
@@ -186,9 +182,12 @@ class Views:
     def _estimate(self, estimate: SceneEstimate) -> Iterator[Drawing]:
         """The ranker's estimate ends the animation of the particles; the refiner's, with its doubt, replaces it."""
         yield Transform("world/camera", base_from_camera(estimate))
-        winner = next((item for item in self._posteriors if _same_objects(item, estimate)), None)
-        if winner is not None and estimate.probabilities is None:
-            yield from particle_frames(winner, self._colors)
+        # The next image's frame may have come long before: what is shown of the last one goes now.
+        yield from (Clear(path) for path in ("world/camera/doubt", "estimate/objects"))
+        if estimate.probabilities is None:
+            yield from self._convergence(estimate)
+        else:
+            yield NextStep()
         weights = estimate.log_weights - estimate.log_weights.min()
         yield BarChart(
             "weights/hypotheses", weights if estimate.probabilities is None else estimate.probabilities, _BLUE
@@ -199,6 +198,13 @@ class Views:
         if frame is not None and (estimate.probabilities is not None or not self._refined):
             yield Image("estimate/rgb", self._overlay(frame, estimate))
             yield doubt_boxes(estimate)
+
+    def _convergence(self, estimate: SceneEstimate) -> Iterator[Drawing]:
+        """The filter of the winning hypothesis at work."""
+        yield from (Clear(path) for path in ("world/camera/particles", "cost"))
+        winner = next((item for item in self._posteriors if _same_objects(item, estimate)), None)
+        if winner is not None:
+            yield from particle_frames(winner, self._colors)
 
     def _overlay(self, frame: Frame, estimate: SceneEstimate) -> np.ndarray[Any, np.dtype[np.uint8]]:
         """The observation in grey with the estimated objects, rendered, laid over it."""
@@ -320,16 +326,19 @@ def _size(region: UnknownRegion) -> str:
 def doubt_boxes(estimate: SceneEstimate) -> Boxes2D:
     """Every object over the estimate with its probability and spread, and what no object explains."""
     judged = [item for item in estimate.objects if item.probability is not None]
-    labels = [
-        f"{item.name} {'CONTRADICTED' if item.contradicted else f'{item.probability:.2f}  {_spread(item)}'}"
-        for item in judged
-    ]
+    labels = ["contradicted" if item.contradicted else _doubt_label(item) for item in judged]
     return Boxes2D(
         "estimate/objects",
         np.array([item.box for item in (*judged, *estimate.unknown)]).reshape(-1, 4),
         labels=(*labels, *("unknown" for _ in estimate.unknown)),
         colors=(*map(_certainty, judged), *(_MAGENTA for _ in estimate.unknown)),
     )
+
+
+def _doubt_label(item: ObjectPose) -> str:
+    """The probability; where that is not sure, the spread too."""
+    probability = item.probability or 0.0
+    return f"{probability:.2f}" + ("" if probability >= SURE else f" ± {_spread(item)}")
 
 
 def _certainty(item: ObjectPose) -> Color:

@@ -279,8 +279,9 @@ def test_doubt_is_drawn() -> None:
     (bars,) = [item for item in drawings if isinstance(item, BarChart)]
     assert bars.values.tolist() == [0.8, 0.2]
     assert paths_of(drawings, Image) == ["estimate/rgb"]
+    assert "world/camera/doubt" in paths_of(drawings, Clear)
     (boxes,) = [item for item in drawings if isinstance(item, Boxes2D)]
-    assert boxes.labels == ("cup CONTRADICTED", "unknown") and len(boxes.boxes) == len(boxes.colors) == 2
+    assert boxes.labels == ("contradicted", "unknown") and len(boxes.boxes) == len(boxes.colors) == 2
     (page,) = [item for item in drawings if isinstance(item, Text)]
     assert "probability 0.80" in page.markdown and "| cup | 0.70 | 4 mm 11° |" in page.markdown
     assert "or another pose (0.25)" in page.markdown and "4 x 6 x 10 cm, 900 readings" in page.markdown
