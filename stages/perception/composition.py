@@ -31,22 +31,21 @@ class Composition:
         self.scene = scene
         self._form = form
         self._reaches = [_mask(scene, pixels(box, scene, margin=REACH)) for box in boxes]
-        self._credit = credits(scene, scene.plane_inverse, form)
+        self.credit = credits(scene, scene.plane_inverse, form)
+        """What each pixel costs with the plane alone, H x W metres."""
 
     def bound(self) -> float:
         """What every scene of the hypothesis costs at least."""
         inside = np.logical_or.reduce([np.zeros_like(self.scene.foreground), *self._reaches])
-        return _sum(np.where(inside, 0.0, self._credit))
+        return _sum(np.where(inside, 0.0, self.credit))
 
     def cost(self, layers: Sequence[Float32s]) -> float:
         """d(R, O) of the scene; layers are H x W inverse depths in the order of the boxes."""
         return _sum(self.pixels(layers))
 
-    def without(self, i: int, layers: Sequence[Float32s]) -> tuple[float, float]:
-        """Cost of the scene without object i, and the share of the credit where it may explain that is then open."""
-        costs = self.pixels([*layers[:i], *layers[i + 1 :]], self._reaches[:i] + self._reaches[i + 1 :])
-        inside = self._reaches[i]
-        return _sum(costs), _sum(costs[inside]) / max(_sum(self._credit[inside]), 1e-6)
+    def cost_without(self, i: int, layers: Sequence[Float32s]) -> float:
+        """The cost of the scene without one of its objects."""
+        return _sum(self.pixels([*layers[:i], *layers[i + 1 :]], self._reaches[:i] + self._reaches[i + 1 :]))
 
     def pixels(self, layers: Sequence[Float32s], reaches: Sequence[NDArray[np.bool_]] | None = None) -> Float32s:
         """Cost of every pixel, H x W metres; ``reaches`` are the masks of the layers where these are not all."""
@@ -56,7 +55,7 @@ class Composition:
             nearer = layer > nearest
             nearest = np.where(nearer, layer, nearest)
             allowed = np.where(nearer, reach, allowed)
-        return pixel_costs(self.scene, self._credit, nearest, self._form, allowed)
+        return pixel_costs(self.scene, self.credit, nearest, self._form, allowed)
 
 
 def scene_cost(scene: ObservedScene, layers: Sequence[Float32s], form: CostForm) -> float:

@@ -18,8 +18,10 @@ from stages.scene.catalogue import Catalogue, Floats
 
 _IDLE = 0.01
 """An object explains nothing if it lowers the cost of the scene by a smaller share."""
-_LEFT = 0.2
-"""An object that explains nothing is looked for again if more than this share of its box is unexplained."""
+_LEFT = 0.1
+"""An object in whose box a smaller share of what stands there is unexplained has nothing to gain from another visit."""
+_OPEN = 0.006
+"""A reading is unexplained if it costs more, metres: noise and the edges of simplified meshes stay below."""
 
 
 @dataclass(frozen=True)
@@ -162,9 +164,8 @@ class SceneFilter:
         return self._tracks[key]
 
     def _settle(self, draft: _Draft) -> None:
-        """Visits objects again, the others known, until nothing changes or the sweeps are used up."""
-        poor = {i for i, found in enumerate(self._fits(draft)) if found.cost > self._settings.poor}
-        stale = poor | {i for i in range(len(draft.suspects)) if draft.is_reached(i)}
+        """Visits objects again, the others known, while something in their boxes is unexplained and things change."""
+        stale = set(range(len(draft.suspects)))
         for number in range(self._settings.sweeps):
             if number == 1:
                 stale |= self._rescue(draft)
@@ -176,9 +177,10 @@ class SceneFilter:
         The worst fits come first: an object that alone took another's place must leave before that one is visited.
         """
         keys = self._keys(draft, b"sweep%d" % number)
-        fits = [found.cost for found in self._fits(draft)]
+        left = draft.unexplained()
+        fits = [found.cost for found in self._found(draft.scene, draft.tracks, draft.layers)]
         changed: set[int] = set()
-        for i in sorted(stale, key=lambda i: (-fits[i], i)):
+        for i in sorted((i for i in stale if left[i] > _LEFT), key=lambda i: (-fits[i], i)):
             box = pixels(draft.suspects[i].box, draft.scene)
             visit = self._filter(draft.suspects[i].label).revisit
             track = visit(draft.scene, draft.background(i), box, draft.tracks[i], rng=_generator(keys[i]))
@@ -195,8 +197,7 @@ class SceneFilter:
         share = self._settings.iterations // max(1, len(keys))
         changed: set[int] = set()
         for i, suspect in enumerate(draft.suspects):
-            without, left = draft.without(i)
-            if draft.cost < without * (1 - _IDLE) or left < _LEFT:
+            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained()[i] <= _LEFT:
                 continue
             run = self._filter(suspect.label).run
             box = pixels(suspect.box, draft.scene)
@@ -211,9 +212,6 @@ class SceneFilter:
 
     def _composition(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> Composition:
         return Composition(scene, self._settings.cost, [suspect.box for suspect in suspects])
-
-    def _fits(self, draft: _Draft) -> Iterator[Found]:
-        return self._found(draft.scene, draft.tracks, draft.layers)
 
     def _result(
         self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s], cost: float, *,
@@ -272,17 +270,22 @@ class _Draft:
         """The plane and all objects but one."""
         return _composite(self.scene, self.layers[:i] + self.layers[i + 1 :])
 
-    def is_reached(self, i: int) -> bool:
-        """Whether another object's layer reaches into the box of object i."""
-        return any(j != i and bool((self.layers[j][self._windows[i]] > 0).any()) for j in range(len(self.layers)))
-
     def others_reached(self, i: int) -> set[int]:
         """The objects into whose boxes the layer of object i reaches, itself among them."""
         return {j for j, window in enumerate(self._windows) if bool((self.layers[i][window] > 0).any())}
 
-    def without(self, i: int) -> tuple[float, float]:
-        """Cost of the scene without one object, and the share of what stands in its box that is then unexplained."""
-        return self.composition.without(i, self.layers)
+    def cost_without(self, i: int) -> float:
+        """Cost of the scene without one object."""
+        return self.composition.cost_without(i, self.layers)
+
+    def unexplained(self) -> list[float]:
+        """For every box the share of what stands in it that the scene does not explain."""
+        costs, credit = self.composition.pixels(self.layers), self.composition.credit
+        return [
+            float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
+            / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
+            for window in self._windows
+        ]
 
     def take(self, i: int, track: Track, layer: Float32s) -> bool:
         """Moves an object where that lowers the cost of the scene."""
