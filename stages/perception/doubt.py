@@ -43,7 +43,7 @@ _COLOUR = 0.5
 """CIELAB units of mean distance that count as one nat."""
 _TURNS = np.deg2rad(np.arange(10.0, 360.0, 10.0))
 _SHIFTS = np.array([-0.05, -0.03, -0.015, 0.015, 0.03, 0.05])
-_REFINED = 40
+_REFINED = 24
 _SCALES = ((np.deg2rad(10.0), 0.010), (np.deg2rad(3.5), 0.0035), (np.deg2rad(1.2), 0.0012))
 """Radians and metres by which the nearest poses are spread: from what an image can leave open to what it resolves."""
 _NEARBY = 96
@@ -326,7 +326,7 @@ class _Look:
         nats = (self._likelihood.costs(probes) - own) / unit + self._colour(probes, item.rivals)
         nats = np.clip(nats, -_CAP, 50.0)
         angles, metres = self._apart(probes)
-        away = (angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)
+        away = self._is_away(probes)
         near_metres, near_radians = self._spread(own, unit)
         wide_metres, wide_radians = _profile(nats, metres, angles)
         chosen = self._alternatives(probes[away], nats[away])
@@ -355,7 +355,7 @@ class _Look:
 
     def _probes(self, rivals: Sequence[Rival]) -> Floats:
         """Turns about the object's axes (the plane's normal with three degrees of freedom), flips, shifts and
-        rivals; the better ones refined too."""
+        rivals; the better ones that are not nearly the same refined too."""
         flips = self._model.proposals.all_flips(self._pose, self._scene.T_camera_table)[1:]
         axes = self._scene.T_camera_table[:3, :3] if self._model.dof == 3 else self._pose[:, :3]
         spin = axes.T[2:] if self._model.dof == 3 else axes.T
@@ -364,9 +364,14 @@ class _Look:
         shifts = (slide[:, None] * _SHIFTS[:, None]).reshape(-1, 3)
         starts = [flips, self._moved(turns, np.zeros(3)), self._moved(np.eye(3)[None], shifts)]
         probes = np.concatenate([*starts, *(rival.T_camera_object[None] for rival in rivals)])
-        promising = probes[np.argsort(self._likelihood.costs(probes), kind="stable")[:_REFINED]]
+        away = probes[self._is_away(probes)]
+        promising = away[np.argsort(self._likelihood.costs(away), kind="stable")[:_REFINED]]
         refined = self._likelihood.refine(promising, self._directions, steps=4, gate=0.02)
         return np.concatenate([probes, refined])
+
+    def _is_away(self, poses: Floats) -> NDArray[np.bool_]:
+        angles, metres = self._apart(poses)
+        return (angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)
 
     def _spread(self, own: float, unit: float) -> tuple[float, float]:
         """Standard deviations of position and angle under the tempered likelihood, by importance sampling.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.perception.likelihood import ObservedScene
+from stages.perception.poses import rotate
 from stages.perception.rasteriser import Float32s
 from stages.scene.catalogue import Floats
 
@@ -53,10 +54,7 @@ def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[R
     """
     lonely = _opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
     count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
-    near = scene.view.rays() * scene.depth[..., None]
-    T = scene.T_camera_table
-    points = ((near - T[:3, 3])[..., None, :] * T[:3, :3].T).sum(-1)
-    found = [_region(scene, labels == number, points) for number in range(1, count)]
+    found = [_region(scene, labels == number) for number in range(1, count)]
     return tuple(sorted((region for region in found if region is not None), key=lambda region: -region.points))
 
 
@@ -92,15 +90,17 @@ def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
     return open_readings
 
 
-def _region(scene: ObservedScene, mask: Mask, points_table: Floats) -> Region | None:
+def _region(scene: ObservedScene, mask: Mask) -> Region | None:
     rows, columns = np.nonzero(mask)
     z = scene.depth[rows, columns].astype(np.float64)
     if len(rows) < _POINTS or float((z**2).sum()) / (scene.view.fx * scene.view.fy) < _AREA:
         return None
-    box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
-    low, high = np.percentile(points_table[rows, columns], [2, 98], axis=0)
+    T = scene.T_camera_table
+    points = scene.view.rays()[rows, columns] * z[:, None] - T[:3, 3]
+    low, high = np.percentile(rotate(T[:3, :3].T, points), [2, 98], axis=0)
     if high[2] < _TOP:
         return None
+    box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
     return Region(box, len(rows), (low + high) / 2, high - low)
 
 
