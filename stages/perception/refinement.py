@@ -125,17 +125,23 @@ class SceneRefiner:
         self._models: dict[str, _Model] = {}
 
     def warm_up(self) -> None:
-        """Lays out every object, so that the first image waits for nothing."""
+        """Lays out every object and compiles the kernels (or loads them), so that the first image waits for nothing."""
         for label in self._catalogue.objects:
-            self._model(label)
+            self._model(label).prepare()
+        T_camera_table = np.diag([1.0, -1.0, -1.0, 1.0])
+        T_camera_table[2, 3] = 1.1
+        depth = np.full((48, 64), 1.1, np.float32)
+        K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+        scene = ObservedScene.of(depth, depth > 2, K, T_camera_table)
+        placed = [Placed(next(iter(self._catalogue.objects)), T_camera_table)] * 2
+        self.refine(scene, np.zeros((48, 64, 3), np.uint8), placed)
 
     def refine(self, scene: ObservedScene, rgb: NDArray[np.uint8], placed: Sequence[Placed]) -> RefinedScene:
         """Polishes all objects together and settles flips; ``rgb`` is H x W x 3, sRGB, registered to the depth."""
         poses = [np.array(item.T_camera_object[:3], float) for item in placed]
         joint = _Joint(scene, [self._model(item.label) for item in placed], poses, self._settings)
         joint.polish()
-        if joint.settle(rgb):
-            joint.polish()
+        joint.settle(rgb)
         return joint.result()
 
     def _model(self, label: str) -> _Model:
@@ -153,6 +159,10 @@ class _Model:
         self.shape = Shape.of(item.simplified(settings.triangles))
         self.proposals = Proposals(item, settings.dof)
         self.symmetries = item.symmetries.transforms(_YAW_STEP)
+
+    def prepare(self) -> None:
+        """Makes what takes time."""
+        assert self.solid and self.paint
 
     @cached_property
     def solid(self) -> Solid:
@@ -198,10 +208,11 @@ class _Joint:
             moved = {i for i in sorted(stale) if self._polish(i)}
             stale = {j for i in moved for j in range(len(self._models)) if self._touches(i, j)}
 
-    def settle(self, rgb: NDArray[np.uint8]) -> bool:
-        """Chooses between each object's flips, by depth and then by colour; returns whether any object turned."""
+    def settle(self, rgb: NDArray[np.uint8]) -> None:
+        """Chooses between each object's flips, by depth and then by colour, and polishes again if any turned."""
         turned = [self._settle(i, rgb) for i in range(len(self._models))]
-        return any(turned)
+        if any(turned):
+            self.polish()
 
     def result(self) -> RefinedScene:
         """The scene as it stands."""
@@ -240,7 +251,7 @@ class _Joint:
         poses = np.concatenate([self._poses[i][None], flips])
         totals = np.concatenate([present, self._totals(i, place, flips)])
         ranks = totals - _GAIN * place.visible * (np.arange(len(totals)) == 0)
-        kept = _distinct(poses, ranks, self._models[i].symmetries)
+        kept = _distinct(poses, ranks, self._models[i].item.symmetries.transforms())
         kept = [k for k in kept if totals[k] <= totals.min() + place.equal]
         return poses[kept], totals[kept]
 

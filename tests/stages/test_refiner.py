@@ -22,6 +22,11 @@ def seen() -> Rendered:
     return render(PLACED)
 
 
+@pytest.fixture(scope="module")
+def stage() -> Refiner:
+    return Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+
+
 def observation(seen: Rendered) -> Observation:
     return Observation(
         depth=seen.scene.depth, rgb=np.zeros((VIEW.height, VIEW.width, 3), np.uint8),
@@ -41,11 +46,9 @@ def estimate(seen: Rendered) -> SceneEstimate:
     )  # fmt: skip
 
 
-def test_poses_come_closer_and_all_else_stays(seen: Rendered) -> None:
+def test_poses_come_closer_and_all_else_stays(seen: Rendered, stage: Refiner) -> None:
     before = estimate(seen)
-    after = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE))).on_scene_estimate(
-        before, observation(seen), Recorded()
-    )
+    after = stage.on_scene_estimate(before, observation(seen), Recorded())
     assert [item.name for item in after.objects] == [item.name for item in before.objects]
     for item in after.objects:
         assert item.T_camera_object[:3, 3] == pytest.approx(seen.poses[item.name][:3, 3], abs=0.0015)
@@ -53,8 +56,7 @@ def test_poses_come_closer_and_all_else_stays(seen: Rendered) -> None:
     assert msgspec.structs.replace(after, objects=before.objects, probabilities=None, unknown=()) == before
 
 
-def test_the_scene_is_judged(seen: Rendered) -> None:
-    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+def test_the_scene_is_judged(seen: Rendered, stage: Refiner) -> None:
     after = stage.on_scene_estimate(estimate(seen), observation(seen), Recorded())
     assert after.probabilities is not None and after.probabilities.sum() == pytest.approx(1)
     assert all(item.probability is not None and item.spread_metres > 0 for item in after.objects)
@@ -66,15 +68,19 @@ def test_the_scene_is_judged(seen: Rendered) -> None:
 
 
 def test_the_plain_form_passes_the_scene_on(seen: Rendered) -> None:
-    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), form="paper"))
+    plain = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), form="paper"))
     before = estimate(seen)
-    assert stage.on_scene_estimate(before, observation(seen), Recorded()) is before
+    assert plain.on_scene_estimate(before, observation(seen), Recorded()) is before
 
 
-def test_a_scene_without_objects_stays_one(seen: Rendered) -> None:
-    stage = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+def test_a_scene_without_objects_stays_one(seen: Rendered, stage: Refiner) -> None:
     empty = msgspec.structs.replace(estimate(seen), objects=())
     assert stage.on_scene_estimate(empty, observation(seen), Recorded()).objects == ()
+
+
+def test_what_is_unknown_cannot_be_switched_off() -> None:
+    with pytest.raises(Refused, match="'colours' is no improvement"):
+        Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), without=("colours",)))
 
 
 @pytest.mark.parametrize("field", [{"dof": 4}, {"form": "best"}])
