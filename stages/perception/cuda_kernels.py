@@ -61,7 +61,7 @@ def evaluate(lanes, meshes, corners, support, views, firsts, pixels, planes, lim
     total = _ZERO
     if x1 >= x0 and y1 >= y0:
         total = _visible(lanes, mesh, m, (x0, y0, x1, y1), view, firsts[windows[p]], pixels, bound)
-    total = _sum(total)
+    total = block_sum(total)
     if cuda.threadIdx.x == 0:
         out[p] = max(_ZERO, -lowest - bound[3]) * view[4] * view[5] + total
 
@@ -87,7 +87,7 @@ def _lowest(support, mesh, pose, plane):
     first = mesh[FIRST_SUPPORT]
     for i in range(first + cuda.threadIdx.x, first + mesh[SUPPORTS], cuda.blockDim.x):
         lowest = min(lowest, a * support[i, 0] + b * support[i, 1] + c * support[i, 2] + d)
-    return -_greatest(-lowest)
+    return -block_greatest(-lowest)
 
 
 @cuda.jit(device=True)
@@ -167,7 +167,7 @@ def _scan(total, box, top, bottom, columns, view, first_pixel, pixels, bound):
 
 
 @cuda.jit(device=True)
-def _sum(value):
+def block_sum(value):
     """The sum over all threads, by halves: the same order in every run."""
     shared = cuda.shared.array(0, numba.float32)
     shared[cuda.threadIdx.x] = value
@@ -184,7 +184,7 @@ def _sum(value):
 
 
 @cuda.jit(device=True)
-def _greatest(value):
+def block_greatest(value):
     """The greatest value over all threads."""
     shared = cuda.shared.array(0, numba.float32)
     shared[cuda.threadIdx.x] = value

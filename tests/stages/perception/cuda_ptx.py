@@ -13,14 +13,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numba.cuda.dispatcher
-from numba import cuda, float32, int32, void
+from numba import cuda, float32, int32, int64, void
 
-from stages.perception import cuda_kernels
+from stages.perception import cuda_evolution, cuda_kernels
 
-f1, f2, f3 = float32[::1], float32[:, ::1], float32[:, :, ::1]
+f1, f2, f3, f4 = float32[::1], float32[:, ::1], float32[:, :, ::1], float32[:, :, :, ::1]
 i1, i2 = int32[::1], int32[:, ::1]
 SIGNATURES = {
     "evaluate": (cuda_kernels.evaluate, void(f1, i2, f3, f2, f2, i1, f2, f2, f2, f3, i1, i1, f1)),
+    "evolve": (cuda_evolution.evolve, void(f1, f3, f3, i2, f2, f2, f2, f3, f3, f4, f2, f1, int64, i1, f2)),
 }
 MISSING = 3
 """Exit status where the toolkit is not at hand."""
