@@ -18,7 +18,7 @@ from benchmarks.accuracy import Score, described, failed, score
 from benchmarks.datasets import Image, detections_file, images
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
-from stages.perception.renderer import Camera, Item, Renderer
+from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, Floats
 
 _TILE = 240
@@ -32,6 +32,8 @@ _PAPER = (246, 246, 248)
 _INK = (40, 40, 46)
 _WRONG, _RIGHT = (213, 94, 0), (0, 114, 178)
 """Outlines of estimate and truth; distinct for any colour vision."""
+_HEADLIGHT = Lighting((Light("directional", (0.25, 0.4, 1.0), 2.8),), (0.45, 0.45, 0.45))
+"""Shines from the camera into the scene."""
 
 
 class Sheet:
@@ -81,7 +83,7 @@ class Sheet:
 
     def _rendered(self, image: Image, placed: Sequence[tuple[int, Floats]]) -> np.ndarray:
         items = [Item(self._items[label].mesh, T) for label, T in placed]
-        return self._of(image).color(items, _camera(image), background=_PAPER).copy()
+        return self._of(image).color(items, _camera(image), lighting=_HEADLIGHT, background=_PAPER).copy()
 
     def _outline(
         self, picture: np.ndarray, image: Image, placed: tuple[int, Floats], color: tuple[int, int, int]

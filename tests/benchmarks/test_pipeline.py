@@ -1,15 +1,22 @@
 """Perception in one process, on the data sets."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from benchmarks.datasets import images, parse_ids, read_truth, truths_by_image
-from benchmarks.estimate import Settings, bop_graph, estimate
+from benchmarks.estimate import Settings, bop_graph, estimate, results
 from benchmarks.pipeline import between
 from runner.contract import Refused
+from stages.devices.bop_results import Result, read_results
+from stages.devices.clutter import write_clutter
+from stages.scene.catalogue import Catalogue
+from tests.stages.perception.scenes import CATALOGUE
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
+ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../shared/data are absent")
 LAYOUT = DATA / "household-layout"
 
@@ -58,3 +65,27 @@ def test_processes_that_share_hypotheses_give_the_scene_that_one_process_gives()
         assert one.T_camera_object.tobytes() == other.T_camera_object.tobytes()
     assert alone.scene.log_weights.tobytes() == shared.scene.log_weights.tobytes()
     assert len(alone.scene.log_weights) == 3 and shared.seconds > 0 and shared.cpu_seconds > 0
+
+
+@pytest.mark.slow
+def test_the_graph_under_its_runner_gives_the_same_bytes(tmp_path: Path) -> None:
+    write_clutter(tmp_path, CATALOGUE, scenes=2, seed=11)
+    few = ("particle_filter.particles=50", "particle_filter.iterations=24")
+    ours = estimate(tmp_path, "noisy", Settings(set=few))
+    catalogue = Catalogue.load(tmp_path / "models")
+    paths = (
+        f"camera.dataset={tmp_path}", f"detector.detections={tmp_path}/detections_noisy.json",
+        f"results.path={tmp_path}/live.csv",
+    )  # fmt: skip
+    command = [sys.executable, "-m", "runner.cli", "up", "graphs/bop.yaml", "--recordings", str(tmp_path)]
+    for assignment in (*paths, *few):
+        command += ["--set", assignment]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    theirs = read_results(tmp_path / "live.csv")
+    assert [_line(one) for one in theirs] == [_line(one) for found in ours for one in results(found, catalogue)]
+
+
+def _line(result: Result) -> str:
+    """The line of the CSV without the time."""
+    return result.line().rpartition(",")[0]
