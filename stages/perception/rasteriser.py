@@ -6,9 +6,9 @@ holds inverse depth, which is linear on the screen, so that the depth test is a 
 zero. Back faces are culled. Pixel centres have integer coordinates and edges are inclusive.
 """
 
-# ruff: noqa: PLR0917, PLW3301
+# ruff: noqa: PLR0917
 # pyright: reportMissingParameterType=false
-# Kernels take plain arrays by position, and only nested minima of two values compile to vector instructions.
+# Kernels take plain arrays by position.
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ def _fill_tile(Z, first, wb, wd, q, bx, dx, qx, by, dy, qy):
     for lane in range(_u(LANES)):
         x, y = _f(np.int32(lane) & np.int32(SIDE - 1)), _f(np.int32(lane) >> np.int32(2))
         b, d = wb + (x * bx + y * by), wd + (x * dx + y * dy)
-        inside = min(min(b, d), one - b - d) >= zero
+        inside = min(b, d) >= zero and b + d <= one
         inverse = q + (x * qx + y * qy) if inside else zero
         seen = Z[first + lane]
         Z[first + lane] = seen if seen > inverse else inverse
