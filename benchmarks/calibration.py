@@ -106,7 +106,7 @@ class Recorder:
 
     def scene(self, image: Image, boxes: str, estimate: Estimate) -> Scene:
         """One image, refined again to see what the refiner compared."""
-        (observation,) = (item for item in estimate.messages if isinstance(item, Observation))
+        observation, *_ = (item for item in estimate.messages if isinstance(item, Observation))
         ranked, *_ = (item for item in estimate.messages if isinstance(item, SceneEstimate))
         scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
         placed = [Placed(item.label, item.T_camera_object) for item in ranked.objects]

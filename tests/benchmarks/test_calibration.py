@@ -1,0 +1,97 @@
+"""Calibration: what is fitted to synthetic evidence predicts it, and what is printed of it is right."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import (
+    Instance,
+    Scene,
+    design,
+    evaluate,
+    expected_error,
+    fit,
+    plot,
+    reliability,
+    wilson,
+    write_constants,
+)
+from stages.perception.doubt import FEATURES, Calibration, Evidence
+
+PLAIN = Evidence(
+    margin=5.0, fit=0.0015, shown=900.0, visible=1.0, gain=0.9, looked_through=0.0, spread_metres=0.002,
+    spread_radians=0.03, hypothesis=0.5, confidence=1.0,
+)  # fmt: skip
+
+
+def synthetic(count: int, seed: int) -> list[Scene]:
+    """Scenes whose poses are right with a probability that margin and spread decide."""
+    rng = np.random.default_rng(seed)
+    scenes: list[Scene] = []
+    for _ in range(count):
+        margin, spread = float(rng.uniform(-2, 8)), float(rng.uniform(0.001, 0.02))
+        evidence = replace(PLAIN, margin=margin, spread_metres=spread)
+        right = bool(rng.random() < 1 / (1 + np.exp(-(margin - 100 * spread))))
+        instance = Instance(
+            "mug", right, float(abs(rng.normal(0, 2 * spread))), 0.1, dict.fromkeys(("20.0", "60.0", "180.0"), evidence)
+        )
+        # The second hypothesis is true as often as a scale of 0.2 says it is.
+        deficit = float(rng.uniform(0, 1))
+        true = int(rng.random() < 1 / (1 + np.exp(deficit / 0.2)))
+        scenes.append(Scene("noisy", 0, true == 0, true, 10.0, (-5.0, -5.0 - 10.0 * deficit), (instance,)))
+    return scenes
+
+
+def test_wilson_interval() -> None:
+    low, high = wilson(8, 10)
+    assert low == pytest.approx(0.4902, abs=1e-4) and high == pytest.approx(0.9433, abs=1e-4)
+    assert wilson(5, 5)[1] == 1.0 and wilson(0, 5)[0] == 0.0
+
+
+def test_bins_hold_every_estimate_once() -> None:
+    called = np.array([0.0, 0.05, 0.9, 0.9, 1.0])
+    bins = reliability(called, np.array([False, False, True, False, True]))
+    assert [(each.count, each.right) for each in bins] == [(2, 0), (2, 1), (1, 1)]
+    assert expected_error(bins) == pytest.approx((2 * 0.025 + 2 * 0.4 + 0) / 5)
+
+
+def test_a_fit_predicts_scenes_that_it_has_not_seen(capsys: pytest.CaptureFixture[str]) -> None:
+    constants = fit(synthetic(800, 1))
+    weights = dict(zip(FEATURES, constants.weights, strict=True))
+    assert weights["margin"] > 1 and weights["spread"] < 0
+    assert 0.13 < constants.hypothesis_scale < 0.3
+    bins = evaluate(synthetic(800, 2), constants)
+    assert expected_error(bins) < 0.05
+    printed = capsys.readouterr().out
+    assert "800 objects in 800 estimates" in printed and "the least sure tenth" in printed
+
+
+def test_evidence_never_turns_round() -> None:
+    # Confidence speaks against in these few scenes; the fit does not believe it.
+    scenes = synthetic(40, 3)
+    turned = [
+        replace(scene, instances=tuple(
+            replace(item, evidence={k: replace(e, confidence=float(not item.right)) for k, e in item.evidence.items()})
+            for item in scene.instances
+        ))
+        for scene in scenes
+    ]  # fmt: skip
+    assert dict(zip(FEATURES, fit(turned).weights, strict=True))["confidence"] == 0.0
+
+
+def test_constants_come_back_as_they_were_written(tmp_path: Path) -> None:
+    constants = fit(synthetic(60, 4))
+    path = tmp_path / "calibration.yaml"
+    write_constants(constants, path, "python -m benchmarks.calibration FOLDER")
+    back = Calibration.load(path)
+    X, _ = design(synthetic(20, 5), constants.hypothesis_scale, constants.pose_scale)
+    assert [back.probability(x) for x in X] == pytest.approx([constants.probability(x) for x in X], abs=5e-3)
+    assert path.read_text().startswith("# Written by `python -m benchmarks.calibration FOLDER`")
+
+
+def test_the_reliability_is_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib comes with the extra `benchmarks`")
+    plot(reliability(np.array([0.2, 0.9, 0.95]), np.array([False, True, True])), tmp_path / "figures" / "plot.png")
+    assert (tmp_path / "figures" / "plot.png").stat().st_size > 5000
