@@ -12,12 +12,12 @@ import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
-from stages.messages.digest import ParticleTrace, Placed, Prospect, Sighting, Start
+from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
 from stages.perception.evaluators import DEVICES, chosen_device
 from stages.perception.likelihood import ObservedScene
 from stages.perception.particle_filter import FilterSettings, Track
 from stages.perception.poses import pose
-from stages.perception.scene_filter import Found, SceneFilter, SceneResult, Suspect
+from stages.perception.scene_filter import Found, SceneFilter, Suspect
 from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.naming import unique_names
 
@@ -85,36 +85,38 @@ class ParticleFilter(Stage):
         scene = _scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
-        reached = self._reached(scene, hypothesis.incumbent)
+        reached = self._reached(scene, hypothesis)
         result = self._filter.estimate(scene, suspects, starts, reached=reached)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
         ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
+        # An object's charge depends on its pose, and what is dropped has none: without it the bound stays a bound.
+        poses = [found.track.T_camera_object for found in result.objects]
+        charge = 0.0 if result.dropped else self._charge(scene, suspects, poses, hypothesis)
         objects = zip(names, hypothesis.candidates, result.objects, strict=True)
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
             objects=tuple(_object(*each) for each in objects),
-            log_weight=-self.config.lambda_r * (result.cost + self._charge(scene, suspects, result, hypothesis)),
+            log_weight=-self.config.lambda_r * (result.cost + charge),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
         )
 
-    def _reached(self, scene: ObservedScene, incumbent: Sequence[Placed]) -> float:
-        """What the known scene costs; infinite where there is none."""
-        if not incumbent:
+    def _reached(self, scene: ObservedScene, hypothesis: Hypothesis) -> float:
+        """What the known scene costs with the charge for its objects; infinite where there is none."""
+        if not hypothesis.starts:
             return np.inf
-        suspects = [_suspect(placed.candidate) for placed in incumbent]
-        return self._filter.begun_cost(scene, suspects, [placed.T_camera_object[:3] for placed in incumbent])
+        suspects = [_suspect(placed.candidate) for placed in hypothesis.incumbent]
+        poses = [placed.T_camera_object[:3] for placed in hypothesis.incumbent]
+        return self._filter.begun_cost(scene, suspects, poses) + self._charge(scene, suspects, poses, hypothesis)
 
     def _charge(
-        self, scene: ObservedScene, suspects: Sequence[Suspect], result: SceneResult, hypothesis: Hypothesis
+        self, scene: ObservedScene, suspects: Sequence[Suspect], poses: Sequence[Floats], hypothesis: Hypothesis
     ) -> float:
-        if not hypothesis.object_cost:
-            return 0.0
-        poses = [found.track.T_camera_object for found in result.objects]
-        return hypothesis.object_cost * self._filter.charge(scene, suspects, poses)
+        share = hypothesis.object_cost
+        return share * self._filter.charge(scene, suspects, poses) if share else 0.0
 
 
 def _scene(observation: Observation) -> ObservedScene:

@@ -43,6 +43,10 @@ class Composition:
         """d(R, O) of the scene; layers are H x W inverse depths in the order of the boxes."""
         return _sum(self.pixels(layers))
 
+    def cost_of_nothing(self) -> float:
+        """The cost without any object."""
+        return _sum(self.credit)
+
     def cost_without(self, i: int, layers: Sequence[Float32s]) -> float:
         """The cost of the scene without one of its objects."""
         return _sum(self.pixels([*layers[:i], *layers[i + 1 :]], self._reaches[:i] + self._reaches[i + 1 :]))
@@ -109,7 +113,7 @@ def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) 
 class FirstLook:
     """Ranks combinations of candidates by what their objects would cost together where each stands if alone."""
 
-    def __init__(self, glimpses: Sequence[Glimpse], *, object_cost: float, truncation: float) -> None:
+    def __init__(self, glimpses: Sequence[Glimpse], *, object_cost: float = 0.0, truncation: float = 0.0) -> None:
         self._glimpses = glimpses
         self._charges = [object_cost * truncation * float((g.inverse > 0).sum()) for g in glimpses]
         width = max((g.left + g.inverse.shape[1] for g in glimpses), default=0)

@@ -74,6 +74,10 @@ class SceneFilter:
         self._filters: dict[str, ObjectFilter] = {}
         self._tracks: OrderedDict[bytes, Track] = OrderedDict()
         self._costs: OrderedDict[bytes, float] = OrderedDict()
+        self.runs = 0
+        """Filters of one object that have run from first guesses."""
+        self.visits = 0
+        """Visits to an object that had a pose already."""
 
     @property
     def looks_first(self) -> bool:
@@ -110,7 +114,7 @@ class SceneFilter:
         """The most likely scene of the suspects, most confident first.
 
         ``starts`` are the looks at each alone, taken here where they are not at hand. A scene that costs ``reached`` is
-        known: a hypothesis whose scenes all must cost more is dropped.
+        known: a hypothesis whose scenes all must cost more is dropped, and one that ends above it is not polished.
         """
         if not self.looks_first:
             tracks = self._sequence(scene, suspects)
@@ -120,7 +124,7 @@ class SceneFilter:
         draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), self._composition(scene, suspects))
         if (bound := draft.composition.bound()) > reached:
             return self._result(scene, begun, draft.layers, bound, dropped=True)
-        self._settle(draft)
+        self._settle(draft, reached)
         return self._result(scene, draft.tracks, draft.layers, draft.cost)
 
     def begun_cost(self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Floats]) -> float:
@@ -128,12 +132,13 @@ class SceneFilter:
         key = self._observation_key(scene, 0)
         for suspect, start in zip(suspects, starts, strict=True):
             key = _extended_by(_extended(key, suspect), start.tobytes())
-        if key not in self._costs:
+        cost = self._costs.get(key)
+        if cost is None:
             layers = [self._layer(scene, s, pose) for s, pose in zip(suspects, starts, strict=True)]
-            self._costs[key] = self._composition(scene, suspects).cost(layers)
+            self._costs[key] = cost = self._composition(scene, suspects).cost(layers)
             if len(self._costs) > self._memory:
                 self._costs.popitem(last=False)
-        return self._costs[key]
+        return cost
 
     def charge(self, scene: ObservedScene, suspects: Sequence[Suspect], poses: Sequence[Floats]) -> float:
         """The cost of all readings on the objects' silhouettes, hidden or not, were none of them explained."""
@@ -154,22 +159,36 @@ class SceneFilter:
     def _remembered(
         self, key: bytes, scene: ObservedScene, background: Float32s, suspect: Suspect, iterations: int
     ) -> Track:
-        if key not in self._tracks:
-            box = pixels(suspect.box, scene)
-            self._tracks[key] = self._filter(suspect.label).run(
-                scene, background, box, iterations=iterations, rng=_generator(key)
-            )
+        track = self._tracks.get(key)
+        if track is None:
+            track = self._run(scene, background, suspect, iterations, key)
+            self._tracks[key] = track
             if len(self._tracks) > self._memory:
                 self._tracks.popitem(last=False)
-        return self._tracks[key]
+        return track
 
-    def _settle(self, draft: _Draft) -> None:
-        """Visits objects again, the others known, while something in their boxes is unexplained and things change."""
+    def _run(self, scene: ObservedScene, background: Float32s, suspect: Suspect, iterations: int, key: bytes) -> Track:
+        self.runs += 1
+        box = pixels(suspect.box, scene)
+        return self._filter(suspect.label).run(scene, background, box, iterations=iterations, rng=_generator(key))
+
+    def _settle(self, draft: _Draft, reached: float) -> None:
+        """Visits objects again, the others known, until nothing changes.
+
+        First those in whose boxes something is unexplained, which is what decides between hypotheses. In a scene that
+        can win all objects follow: what is explained may be explained better by a flipped pose.
+        """
+        self._visit(draft, least=_LEFT, first=0)
+        if draft.cost <= reached:
+            self._visit(draft, least=-np.inf, first=self._settings.sweeps)
+
+    def _visit(self, draft: _Draft, *, least: float, first: int) -> None:
         stale = set(range(len(draft.suspects)))
-        for number in range(self._settings.sweeps):
+        for number in range(first, first + self._settings.sweeps):
             if number == 1:
                 stale |= self._rescue(draft)
-            stale = self._sweep(draft, stale, number)
+            left = draft.unexplained()
+            stale = self._sweep(draft, {i for i in stale if left[i] > least}, number)
 
     def _sweep(self, draft: _Draft, stale: set[int], number: int) -> set[int]:
         """Visits the stale objects with all others known; returns those around which something changed.
@@ -177,10 +196,10 @@ class SceneFilter:
         The worst fits come first: an object that alone took another's place must leave before that one is visited.
         """
         keys = self._keys(draft, b"sweep%d" % number)
-        left = draft.unexplained()
         fits = [found.cost for found in self._found(draft.scene, draft.tracks, draft.layers)]
         changed: set[int] = set()
-        for i in sorted((i for i in stale if left[i] > _LEFT), key=lambda i: (-fits[i], i)):
+        for i in sorted(stale, key=lambda i: (-fits[i], i)):
+            self.visits += 1
             box = pixels(draft.suspects[i].box, draft.scene)
             visit = self._filter(draft.suspects[i].label).revisit
             track = visit(draft.scene, draft.background(i), box, draft.tracks[i], rng=_generator(keys[i]))
@@ -199,9 +218,7 @@ class SceneFilter:
         for i, suspect in enumerate(draft.suspects):
             if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained()[i] <= _LEFT:
                 continue
-            run = self._filter(suspect.label).run
-            box = pixels(suspect.box, draft.scene)
-            track = run(draft.scene, draft.background(i), box, iterations=share, rng=_generator(keys[i]))
+            track = self._run(draft.scene, draft.background(i), suspect, share, keys[i])
             changed |= self._moved(draft, i, track)
         return changed
 

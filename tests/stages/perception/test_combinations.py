@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.messages import Candidate
-from stages.perception.combinations import count_combinations, most_confident
+from stages.perception.combinations import cheapest, count_combinations, count_subsets, most_confident
 
 
 def candidates(*confidences: float) -> list[Candidate]:
@@ -32,3 +32,28 @@ def test_the_best_come_first(confidences: list[float], n: int, limit: int) -> No
     assert len({tuple(c.label for c in combination) for combination in found}) == len(found)
     for combination in found:
         assert [c.confidence for c in combination] == sorted((c.confidence for c in combination), reverse=True)
+
+
+@given(st.integers(0, 7), st.one_of(st.none(), st.integers(0, 8)), st.integers(1, 200), st.integers(0, 99))
+def test_the_cheapest_come_first(m: int, n: int | None, limit: int, seed: int) -> None:
+    costs = {chosen: float(cost) for size in range(m + 1) for chosen, cost in zip(
+        itertools.combinations(range(m), size), np.random.default_rng(seed + size).integers(9, size=1000), strict=False
+    )}  # fmt: skip
+    sizes = range(m + 1) if n is None else [min(n, m)]
+    expected = sorted((costs[chosen], chosen) for size in sizes for chosen in itertools.combinations(range(m), size))
+    assert cheapest(costs.__getitem__, m, n, limit) == [chosen for _, chosen in expected[:limit]]
+    assert count_subsets(m, n) == len(expected)
+
+
+def test_many_candidates_are_searched_with_a_beam() -> None:
+    worth = np.random.default_rng(0).normal(size=40)
+    asked = 0
+
+    def cost(chosen: tuple[int, ...]) -> float:
+        nonlocal asked
+        asked += 1
+        return -float(worth[list(chosen)].sum())
+
+    best = cheapest(cost, 40, 6, 1)[0]
+    assert best == tuple(sorted(np.argsort(-worth)[:6].tolist()))
+    assert asked < 60_000
