@@ -8,6 +8,9 @@ import torch
 from stages.perception.rasteriser import View
 from stages.scene.catalogue import Floats, Mesh
 
+# Images this small only lose time to threads, the more the busier the machine.
+torch.set_num_threads(1)
+
 
 def inverse_depth(mesh: Mesh, T_camera_object: Floats, view: View) -> Floats:
     """H x W image of 1/z, 0 where nothing is: edge functions, inclusive edges, back faces culled."""
