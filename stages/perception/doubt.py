@@ -121,7 +121,7 @@ class Evidence:
     """What the image says of one object's pose."""
 
     margin: float
-    """Nats by which the best pose that is not nearly the same is worse."""
+    """Log-odds of the estimate, and all that counts as the same, against all other poses that were compared."""
     fit: float
     """Mean distance over the pixels that show it, metres, bounded."""
     shown: float
@@ -329,10 +329,12 @@ class _Look:
         away = self._is_away(probes)
         near_metres, near_radians = self._spread(own, unit)
         wide_metres, wide_radians = _profile(nats, metres, angles)
-        chosen = self._alternatives(probes[away], nats[away])
+        cells = self._cells(probes[away], nats[away])
+        weights = np.exp(-nats[away][cells])
+        likely = (weights >= _LIKELY).sum()
         fit, shown, visible, gain = self._shown(own)
         evidence = Evidence(
-            margin=float(nats[away].min(initial=_CAP)),
+            margin=float(-np.log(weights.sum() + np.exp(-_CAP))),
             fit=fit,
             shown=shown,
             visible=visible,
@@ -343,7 +345,8 @@ class _Look:
             hypothesis=hypothesis,
             confidence=item.confidence,
         )
-        return evidence, Others(probes[away][chosen], np.exp(-np.maximum(nats[away][chosen], 0.0)))
+        kept = cells[: min(likely, _KEPT)]
+        return evidence, Others(probes[away][kept], np.minimum(weights[: len(kept)], 1.0))
 
     def _colour(self, probes: Floats, rivals: Sequence[Rival]) -> Floats:
         """What colour says against each probe, nats: what it says against the rival that is nearly the same."""
@@ -391,16 +394,16 @@ class _Look:
         angles, metres = self._apart(poses)
         return float(np.sqrt((weights * metres**2).sum())), float(np.sqrt((weights * angles**2).sum()))
 
-    def _alternatives(self, poses: Floats, nats: Floats) -> NDArray[np.intp]:
-        """Indices of the likeliest poses that are apart from one another, modulo symmetry."""
-        kept: list[int] = []
-        likely = np.flatnonzero(nats < -np.log(_LIKELY))
+    def _cells(self, poses: Floats, nats: Floats) -> NDArray[np.intp]:
+        """Indices of poses, the likeliest first, no two of which would count as the same, modulo symmetry."""
+        likely = np.flatnonzero(nats < _CAP)
         order = likely[distinct_best(poses[likely], nats[likely], 64, metres=RIGHT_METRES, radians=RIGHT_RADIANS)]
+        kept: list[int] = []
         for i in order.tolist():
             angles, metres = self._between(poses[kept], poses[i])
             if bool(((angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)).all()):
                 kept.append(i)
-        return np.asarray(kept[:_KEPT], np.intp)
+        return np.asarray(kept, np.intp)
 
     def _shown(self, own: float) -> tuple[float, float, float, float]:
         """Mean distance and number of readings that show the object, its visible share, and what it saves."""
