@@ -152,30 +152,33 @@ class Window:
         """
         x0, y0, x1, y1 = region
         part = np.s_[y0:y1:stride, x0:x1:stride]
-        credit = credits(scene, background, form)
-        inside = np.zeros_like(credit)
-        inside[box[1] : box[3], box[0] : box[2]] = 1.0
-        cut = (np.ascontiguousarray(a[part]) for a in (background, scene.depth, scene.factor, credit * inside))
-        corner = np.array([x0, y0, x0, y0], float)
-        open_depths = scene.depth[(credit * inside) > 0]
+        credit = np.zeros((y1 - y0, x1 - x0), np.float32)
+        rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
+        credit[box[1] - y0 : box[3] - y0, box[0] - x0 : box[2] - x0] = credits(scene, background, form, (rows, columns))
+        credit = credit[::stride, ::stride]
+        open_depths = scene.depth[part][credit > 0]
         low, high = np.percentile(open_depths, [2, 98]) if len(open_depths) else (0.0, np.inf)
+        corner = np.array([x0, y0, x0, y0], float)
         return Window(
             scene.view.sampled(*region, stride),
-            *cut,
+            *(np.ascontiguousarray(a) for a in (background[part], scene.depth[part], scene.factor[part], credit)),
             box=(np.array(box, float) - corner) / stride,
             reach=(float(low), float(high)),
         )
 
 
-def credits(scene: ObservedScene, background: Float32s, form: CostForm) -> Float32s:
-    """What each pixel costs with the background alone, H x W metres: what an object gains by explaining it."""
-    known = background > 0
-    behind = 1.0 / np.where(known, background, 1.0) - scene.depth
-    miss = np.where(known, scene.factor * behind, form.truncation * (scene.factor > 0))
+def credits(
+    scene: ObservedScene, background: Float32s, form: CostForm, part: tuple[slice, slice] = np.s_[:, :]
+) -> Float32s:
+    """What each pixel of a part costs with the background alone, metres: what an object gains by explaining it."""
+    inverse, factor = background[part], scene.factor[part]
+    known = inverse > 0
+    behind = 1.0 / np.where(known, inverse, 1.0) - scene.depth[part]
+    miss = np.where(known, factor * behind, form.truncation * (factor > 0))
     if form.plain:
         return np.abs(miss).astype(np.float32)
     # Only readings in front of the background ask for an explanation; the plane's own noise does not.
-    return (np.clip(miss, 0.0, form.truncation) * scene.foreground).astype(np.float32)
+    return (np.clip(miss, 0.0, form.truncation) * scene.foreground[part]).astype(np.float32)
 
 
 class ObjectLikelihood:

@@ -26,6 +26,11 @@ Rectangle = tuple[int, int, int, int]
 _GAIN = 0.002
 """Share of the cost without the object by which another pose must be better to replace an estimate."""
 
+_FRESH = 2
+"""New guesses per particle when an object is visited again."""
+_LEADERS = 6
+"""Poses that are polished to the end."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FilterSettings:
@@ -171,7 +176,7 @@ class ObjectFilter:
         poses = population.begin(coarse)
         for phase in (coarse, fine):
             poses = population.evolve(poses, phase)
-        return population.finish(poses, fine)
+        return population.finish(poses, coarse, fine)
 
     def revisit(
         self, scene: ObservedScene, background: Float32s, box: Rectangle, track: Track, *, rng: np.random.Generator
@@ -183,7 +188,7 @@ class ObjectFilter:
         guess = self._guess(scene, background, box)
         coarse, fine = self._phases(scene, background, box, guess, 1)
         population = _Population(self, guess, rng)
-        found = population.finish(population.around(track.T_camera_object, coarse), fine)
+        found = population.finish(population.around(track.T_camera_object, coarse), coarse, fine)
         before = float(fine.likelihood.energies(track.T_camera_object[None])[0])
         if found.cost > before - _GAIN * abs(fine.likelihood.base):
             return track
@@ -195,7 +200,7 @@ class ObjectFilter:
         part = np.s_[box[1] : box[3], box[0] : box[2]]
         rays = scene.view.rays()[part]
         depth = scene.depth[part]
-        open_questions = credits(scene, background, self.settings.cost)[part] > 0.006
+        open_questions = credits(scene, background, self.settings.cost, part) > 0.006
         for chosen in (open_questions & scene.foreground[part], scene.foreground[part], depth > 0):
             if chosen.sum() >= 12:
                 return Guess(rays[chosen] * depth[chosen, None], scene.T_camera_table)
@@ -266,25 +271,32 @@ class _Population:
         """A small generation about a known pose: it, some noise and the better ones of new guesses."""
         near = np.repeat(pose[None], self._settings.particles // 8, 0)
         near = self._proposals.diffuse(near, phase.directions, metres=0.008, radians=np.deg2rad(8.0), rng=self._rng)
-        fresh = self.begin(phase)
+        fresh = self._proposals.initial(self._guess, _FRESH * self._settings.particles, self._rng)
         cheap = distinct_best(fresh, phase.likelihood.energies(fresh), 32, metres=0.01, radians=np.deg2rad(15.0))
         return np.concatenate(
             [pose[None], near, phase.likelihood.refine(fresh[cheap], phase.directions, steps=4, gate=0.03)]
         )
 
-    def finish(self, poses: Floats, phase: _Phase) -> Track:
+    def finish(self, poses: Floats, coarse: _Phase, phase: _Phase) -> Track:
         """The particle of least cost (equation 10), after polish where that lowers its cost further."""
         costs = phase.likelihood.energies(poses)
         if self._settings.polished:
-            leaders = poses[distinct_best(poses, costs, 12, metres=0.01, radians=np.deg2rad(10.0))]
-            flips = self._proposals.all_flips(leaders[0], self._guess.T_camera_table)
-            leaders = np.concatenate([leaders, flips])
-            refined = phase.likelihood.refine(leaders, phase.directions, steps=6, gate=0.03)
-            poses = np.concatenate([leaders, refined])
+            poses = self._leaders(poses, costs, coarse, phase)
             costs = phase.likelihood.energies(poses)
         champion = int(np.argmin(costs))
         self._keep(poses, float(costs[champion]))
         return self._track(poses[champion], float(costs[champion]))
+
+    def _leaders(self, poses: Floats, costs: Floats, coarse: _Phase, fine: _Phase) -> Floats:
+        """The best of the distinct poses and of all flips of the first, before and after polish; polish sorts them out
+        where pixels are few, and takes the few that remain to the end."""
+        best = poses[distinct_best(poses, costs, 12, metres=0.01, radians=np.deg2rad(10.0))]
+        flips = self._proposals.all_flips(best[0], self._guess.T_camera_table)[1:]
+        rough = coarse.likelihood.refine(np.concatenate([best, flips]), coarse.directions, steps=5, gate=0.03)
+        leaders = np.concatenate([best, rough])
+        costs = fine.likelihood.energies(leaders)
+        few = leaders[distinct_best(leaders, costs, _LEADERS, metres=0.003, radians=np.deg2rad(4.0))]
+        return np.concatenate([few, fine.likelihood.refine(few, fine.directions, steps=6, gate=0.03)])
 
     def _next(self, poses: Floats, costs: Floats, champion: Floats, phase: _Phase, progress: float) -> Floats:
         """Resampling and transition: equation 5, then the improvements that are switched on."""

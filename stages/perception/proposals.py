@@ -23,6 +23,10 @@ from stages.scene.catalogue import CatalogueObject, Floats
 
 Dof = Literal[3, 6]
 _SAME = np.deg2rad(12.0)
+_FACES = 24
+_ROUGHLY = 0.1
+"""Normals that differ by less belong to one face."""
+_CLEARLY = 0.88
 _RESTING = 0.5
 """Share of the first guesses in which the object rests on the plane, where it need not."""
 
@@ -47,7 +51,9 @@ class Proposals:
         # The catalogue's z axis is up when an object stands; resting poses of scanned meshes may lean a little.
         self._resting = np.eye(3)[None] if dof == 3 else np.stack([np.eye(3), *item.resting])
         self._symmetries = item.symmetries.transforms()
-        self._flips = self._distinct(np.concatenate([cube_rotations(), item.symmetries.near[:, :3, :3]]))
+        self._axes = box_axes(self._vertices)
+        turns = compose(compose(self._axes, cube_rotations()), self._axes.T)
+        self._flips = self._distinct(np.concatenate([turns, item.symmetries.near[:, :3, :3]]))
 
     def initial(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
         """First guesses: a reading inside the box is laid on the surface of the turned object."""
@@ -91,7 +97,7 @@ class Proposals:
         flips = self._flip_turns(poses, T_camera_table)
         chosen = flips[np.arange(len(poses)), rng.integers(flips.shape[1], size=len(poses))]
         if self.dof == 6:
-            axes = poses[np.arange(len(poses)), :, rng.integers(3, size=len(poses))]
+            axes = rotate(poses[:, :, :3], self._axes.T[rng.integers(3, size=len(poses))])
             turns = exp_so3(axes * rng.uniform(-np.pi, np.pi, (len(poses), 1)))
             chosen = np.where((np.arange(len(poses)) % 2 == 0)[:, None, None], chosen, turns)
         return self._turned(poses, chosen, np.zeros(3))
@@ -143,6 +149,38 @@ class Proposals:
         along = (turned * readings[:, None]).sum(-1)
         nearest = turned[np.arange(len(turned)), np.argmin(along, 1)]
         return nearest + rotate(rotations, self._centre)
+
+
+def box_axes(vertices: Floats) -> Floats:
+    """Axes of the smallest box around a mesh, as the columns of a rotation: a scan need not lie along its frame.
+
+    The box of least volume has a face along a face of the convex hull (O'Rourke, 1985, but for rare exceptions). The
+    larger faces are tried in pairs, and the frame's own axes are kept unless a box is clearly smaller.
+    """
+    hull = ConvexHull(vertices)
+    corners = vertices[hull.vertices]
+    normals = _larger_faces(vertices, hull)
+    first, second = np.repeat(normals, len(normals), 0), np.tile(normals, (len(normals), 1))
+    across = np.cross(first, second)
+    length = np.sqrt((across**2).sum(1))
+    first, across = first[length > 0.1], across[length > 0.1] / length[length > 0.1, None]
+    frames = np.concatenate([np.eye(3)[None], np.stack([first, across, np.cross(first, across)], -1)])
+    along = (corners[None, :, :, None] * frames[:, None]).sum(2)
+    volumes = (along.max(1) - along.min(1)).prod(1)
+    best = int(np.argmin(volumes))
+    return frames[best] if volumes[best] < _CLEARLY * volumes[0] else frames[0]
+
+
+def _larger_faces(vertices: Floats, hull: ConvexHull) -> Floats:
+    """Unit normals of the faces of a convex hull that have the most area, coplanar triangles together, N x 3."""
+    corners = vertices[hull.simplices]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = hull.equations[:, :3] * np.sqrt((across**2).sum(1))[:, None]
+    _, which = np.unique(np.round(hull.equations[:, :3] / _ROUGHLY), axis=0, return_inverse=True)
+    faces = np.stack([np.bincount(which.reshape(-1), component) for component in outward.T], -1)
+    sizes = np.sqrt((faces**2).sum(1))
+    largest = np.argsort(-sizes, kind="stable")[:_FACES]
+    return faces[largest] / sizes[largest, None]
 
 
 def _put_down(poses: Floats, resting: NDArray[np.bool_], support: Floats, T_camera_table: Floats) -> Floats:
