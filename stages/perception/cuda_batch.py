@@ -64,8 +64,8 @@ class Batch:
     def write_costs(self, poses: Any, objects: Any, windows: Any, out: Any, *, stream: Any = 0) -> None:
         """Changes of cost, P, for poses P x 3 x 4 float32 of objects P and windows P (int32); all on the device.
 
-        Anything with ``__cuda_array_interface__`` is taken as it lies, torch tensors among them; NumPy in the
-        simulator. Returns before the device has finished.
+        Anything with ``__cuda_array_interface__`` is taken as it lies, torch tensors among them. Returns before the
+        device has finished.
         """
         arrays = [_in_place(array) for array in (poses, objects, windows, out)]
         evaluate[len(poses), self.launch.threads, stream, self._shared_bytes](*self._meshes, *self._windows, *arrays)
@@ -91,10 +91,10 @@ def change_of_cost_cuda(batch: Batch, poses: Any) -> Float32s:
 
 
 def _in_place(array: Any) -> Any:
-    """A view of a device array of any library, without a copy."""
-    if SIMULATED or not hasattr(array, "__cuda_array_interface__"):
+    """A view of a device array of any library, without a copy; in the simulator devices are the host's memory."""
+    if hasattr(array, "copy_to_host"):
         return array
-    return cuda.as_cuda_array(array)
+    return np.asarray(array) if SIMULATED else cuda.as_cuda_array(array)
 
 
 def _meshes(shapes: Sequence[Shape], launch: Launch) -> list[Any]:

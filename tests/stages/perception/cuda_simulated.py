@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.cuda import exchanged, problem, resident
 from stages.perception.cuda_batch import Batch, Launch, Look, change_of_cost_cuda
 from stages.perception.cuda_filter import CudaFilter, Population, Schedule
 from stages.perception.cuda_math import SIMULATED
 from stages.perception.cuda_random import normals, philox
+from stages.perception.evaluators import chosen_device
 from stages.perception.kernels import IMPOSSIBLE
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.poses import compose, exp_so3, log_so3, pose, rotate
@@ -139,6 +142,15 @@ def test_bands_and_teams_change_no_byte() -> None:
     for launch in (Launch(threads=8, z_buffer_bytes=4, team=1), Launch(threads=8, z_buffer_bytes=300, team=8)):
         batch = Batch([cpu.shape], [look(cpu, seen)], launch)
         assert change_of_cost_cuda(batch, poses).tobytes() == whole.tobytes()
+
+
+def test_tensors_are_read_and_written_where_they_lie() -> None:
+    seen = scene()
+    cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
+    poses, out = torch.as_tensor(around(2), dtype=torch.float32), torch.zeros(2)
+    which = torch.zeros(2, dtype=torch.int32)
+    Batch([cpu.shape], [look(cpu, seen)], TINY).write_costs(poses, which, which, out)
+    assert out.numpy() == pytest.approx(cpu.costs(poses.numpy()) - cpu.base, rel=1e-4, abs=0.01)
 
 
 def population(cpu: ObjectLikelihood, poses: Floats, **changes: Any) -> Population:
@@ -272,3 +284,18 @@ def test_populations_of_two_hypotheses_converge_side_by_side() -> None:
     assert (np.diff(history) <= 0).all()
     assert (history[:, -1] < history[:, 0]).all()
     assert once.generation().tobytes() == again.generation().tobytes()
+
+
+def test_the_benchmark_runs() -> None:
+    cpu, poses = problem(CATALOGUE["tea_box"], 24, 12)
+    assert exchanged(cpu, poses[:1], iterations=1, launch=TINY) > 0
+    assert resident(cpu, poses[:1], copies=2, iterations=1, launch=TINY) > 0
+
+
+def test_the_likelihood_takes_the_device() -> None:
+    seen = scene()
+    cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
+    gpu = ObjectLikelihood(cpu.shape, cpu.window, seen, cpu.form, device=chosen_device("auto", place="device"))
+    poses = around(2)
+    assert gpu.energies(poses) == pytest.approx(cpu.energies(poses), rel=1e-4)
+    assert gpu.energies(poses).dtype == np.float64
