@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from stages.perception.pixel_math import INLINED, KERNEL, height_row, pixel_cost, screen_matrix
-from stages.perception.rasteriser import LANES, SIDE, rasterise, screen_window, tiled, untile, working_memory
+from stages.perception.rasteriser import LANES, SIDE, rasterise, screen_window, tiled, tiles_of, untile, working_memory
 
 IMPOSSIBLE = 1e6
 """Cost of a pose that reaches into the camera, in metres times pixels."""
@@ -19,15 +19,23 @@ _u = np.uintp
 
 
 @numba.njit(**KERNEL)
-def change_of_cost(lanes, blocks, corners, support, poses, view, background, observed, factor, credit, plane, limits,
-              out):  # fmt: skip
-    """Writes for each pose what its visible pixels cost less what the background costs there, plus sinking."""
-    Z, scratch, survivors = working_memory(blocks, view)
-    images = np.zeros((4, Z.shape[0]), np.float32)
+def evidence(background, observed, factor, credit, view):
+    """The four images (H x W, flat) that poses are weighed against, in tiles, 4 x N; overhang is no reading."""
+    images = np.zeros((4, tiles_of(view) * LANES), np.float32)
     tiled(background, view, images[0])
     tiled(observed, view, images[1])
     tiled(factor, view, images[2])
     tiled(credit, view, images[3])
+    return images
+
+
+@numba.njit(**KERNEL)
+def change_of_cost(lanes, blocks, corners, support, poses, view, images, plane, limits, out):
+    """Writes for each pose what its visible pixels cost less what the background costs there, plus sinking.
+
+    ``images`` is what ``evidence`` made of the view's images.
+    """
+    Z, scratch, survivors = working_memory(blocks, view)
     pitch = (int(view[4]) + SIDE - 1) // SIDE
     area = view[4] * view[5]
     for p in range(poses.shape[0]):

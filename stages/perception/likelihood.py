@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from stages.perception.evaluators import Device, cuda_evaluator
-from stages.perception.kernels import change_of_cost, gauss_newton
+from stages.perception.kernels import change_of_cost, evidence, gauss_newton
 from stages.perception.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.scene.catalogue import Floats, Mesh
 
@@ -191,6 +191,10 @@ class ObjectLikelihood:
         self.window = window
         self.form = form
         self._plane = scene.plane
+        self._evidence = evidence(
+            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(), window.credit.ravel(),
+            window.view.numbers,
+        )  # fmt: skip
         self.base = float(window.credit.sum(dtype=np.float64))
         """Cost of the window without the object."""
         self._on_gpu = None if device == "cpu" else cuda_evaluator(shape, window, scene.plane, form)
@@ -206,8 +210,7 @@ class ObjectLikelihood:
         limits = np.array([form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack], np.float32)
         change_of_cost(
             soup.lanes, soup.blocks, soup.corners, self.shape.support, np.ascontiguousarray(poses, np.float32),
-            window.view.numbers, window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
-            window.credit.ravel(), self._plane, limits, out,
+            window.view.numbers, self._evidence, self._plane, limits, out,
         )  # fmt: skip
         return out
 

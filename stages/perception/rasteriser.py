@@ -125,9 +125,14 @@ def render_inverse(lanes, blocks, corners, pose, view, image):
 @numba.njit(**INLINED)
 def working_memory(blocks, view):
     """A zeroed z-buffer of tiles, room for the set-up of every triangle and for the list of those that survive it."""
-    tiles = ((int(view[4]) + SIDE - 1) // SIDE) * ((int(view[5]) + SIDE - 1) // SIDE)
-    return (np.zeros(tiles * LANES, np.float32), np.zeros(blocks * SETUP_ROWS * LANES, np.float32),
+    return (np.zeros(tiles_of(view) * LANES, np.float32), np.zeros(blocks * SETUP_ROWS * LANES, np.float32),
             np.zeros(blocks * LANES + 1, np.int32))  # fmt: skip
+
+
+@numba.njit(**INLINED)
+def tiles_of(view):
+    """How many tiles the view has, those that hang over its edges included."""
+    return ((int(view[4]) + SIDE - 1) // SIDE) * ((int(view[5]) + SIDE - 1) // SIDE)
 
 
 @numba.njit(**INLINED)
