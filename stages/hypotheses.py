@@ -10,13 +10,12 @@ from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Candidates, Frame, Hypothesis, Observation
 from stages.messages.digest import Glimpse, Placed, Prospect, Sighting, Start
 from stages.perception.combinations import cheapest, count_combinations, count_subsets, most_confident, ordered
-from stages.perception.composition import FirstLook
-from stages.perception.likelihood import CostForm
+from stages.perception.composition import FirstLook, charge
 from stages.perception.preprocessing import preprocess
 
 OBJECT_COST = 0.1
-"""With N_c unknown an object must explain a tenth of what it would if all of its silhouette were in sight and nothing
-else explained it."""
+"""With N_c unknown an object must explain a tenth of what readings all over its box would cost: what is there explains
+a fifth at least, even where its box is loose; what is not there, or there already, next to nothing."""
 
 
 class Hypotheses(Stage):
@@ -88,7 +87,7 @@ class Hypotheses(Stage):
         ctx: Context,
     ) -> Iterator[Hypothesis]:  # fmt: skip
         object_cost = 0.0 if number is not None else OBJECT_COST
-        look = FirstLook(glimpses, object_cost=object_cost, truncation=CostForm().truncation)
+        look = FirstLook(glimpses, [charge([candidate.box], object_cost) for candidate in candidates])
         combinations = cheapest(look.cost, len(candidates), number, self.config.finalists)
         left_out = count_subsets(len(candidates), number) - len(combinations)
         if left_out:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
 from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
+from stages.perception.composition import charge
 from stages.perception.evaluators import DEVICES, chosen_device
 from stages.perception.likelihood import ObservedScene
 from stages.perception.particle_filter import FilterSettings, Track
@@ -85,38 +85,32 @@ class ParticleFilter(Stage):
         scene = _scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
-        reached = self._reached(scene, hypothesis)
+        charged = charge([suspect.box for suspect in suspects], hypothesis.object_cost)
+        reached = self._reached(scene, hypothesis, charged)
         result = self._filter.estimate(scene, suspects, starts, reached=reached)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
         ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
-        # An object's charge depends on its pose, and what is dropped has none: without it the bound stays a bound.
-        poses = [found.track.T_camera_object for found in result.objects]
-        charge = 0.0 if result.dropped else self._charge(scene, suspects, poses, hypothesis)
         objects = zip(names, hypothesis.candidates, result.objects, strict=True)
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
             objects=tuple(_object(*each) for each in objects),
-            log_weight=-self.config.lambda_r * (result.cost + charge),
+            log_weight=-self.config.lambda_r * (result.cost + charged),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
         )
 
-    def _reached(self, scene: ObservedScene, hypothesis: Hypothesis) -> float:
-        """What the known scene costs with the charge for its objects; infinite where there is none."""
+    def _reached(self, scene: ObservedScene, hypothesis: Hypothesis, charged: float) -> float:
+        """What a scene whose objects are ``charged`` so much may cost and still weigh as much as the known one."""
         if not hypothesis.starts:
             return np.inf
         suspects = [_suspect(placed.candidate) for placed in hypothesis.incumbent]
         poses = [placed.T_camera_object[:3] for placed in hypothesis.incumbent]
-        return self._filter.begun_cost(scene, suspects, poses) + self._charge(scene, suspects, poses, hypothesis)
-
-    def _charge(
-        self, scene: ObservedScene, suspects: Sequence[Suspect], poses: Sequence[Floats], hypothesis: Hypothesis
-    ) -> float:
-        share = hypothesis.object_cost
-        return share * self._filter.charge(scene, suspects, poses) if share else 0.0
+        # For the incumbent itself the charges cancel exactly.
+        difference = charge([suspect.box for suspect in suspects], hypothesis.object_cost) - charged
+        return self._filter.begun_cost(scene, suspects, poses) + difference
 
 
 def _scene(observation: Observation) -> ObservedScene:

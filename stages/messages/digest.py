@@ -101,8 +101,7 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     incumbent: tuple[Placed, ...] = ()
     """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
     object_cost: float = 0.0
-    """What every object adds to the cost of the scene: this share of what the readings on its silhouette would cost,
-    were none of them explained; 0 where the number of objects is known."""
+    """Every object adds this share of what readings all over its box would cost; 0 where N_c is known."""
 
 
 class Posterior(Part, frozen=True, kw_only=True):

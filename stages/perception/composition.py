@@ -88,9 +88,15 @@ def pixel_costs(
     return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
 
 
-def silhouette(scene: ObservedScene, layer: Float32s) -> int:
-    """Readings on the silhouette of a layer."""
-    return int(((layer > 0) & (scene.factor > 0)).sum())
+def charge(boxes: Sequence[Floats], share: float) -> float:
+    """What objects cost by being there, metres times pixels: ``share`` of what their boxes would, were nothing in them
+    explained.
+
+    A box frames what is visible of its object, so the object can explain most of it. One that explains less than its
+    share is not worth having: a double of another, or one that is not there.
+    """
+    areas = [float(box[2] - box[0]) * float(box[3] - box[1]) for box in boxes]
+    return share * CostForm().truncation * sum(areas)
 
 
 def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
@@ -113,9 +119,10 @@ def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) 
 class FirstLook:
     """Ranks combinations of candidates by what their objects would cost together where each stands if alone."""
 
-    def __init__(self, glimpses: Sequence[Glimpse], *, object_cost: float = 0.0, truncation: float = 0.0) -> None:
+    def __init__(self, glimpses: Sequence[Glimpse], charges: Sequence[float] | None = None) -> None:
+        """``charges`` are what each object costs by being there, metres times pixels."""
         self._glimpses = glimpses
-        self._charges = [object_cost * truncation * float((g.inverse > 0).sum()) for g in glimpses]
+        self._charges = charges or [0.0] * len(glimpses)
         width = max((g.left + g.inverse.shape[1] for g in glimpses), default=0)
         height = max((g.top + g.inverse.shape[0] for g in glimpses), default=0)
         self._inverse = np.zeros((height, width), np.float32)
@@ -132,7 +139,7 @@ class FirstLook:
             nearer = one.inverse > self._inverse[part]
             np.copyto(self._inverse[part], one.inverse, where=nearer)
             np.copyto(self._change[part], one.change, where=nearer)
-        return (_sum(self._change) + sum(self._charges[i] for i in chosen)) * STRIDE**2
+        return _sum(self._change) * STRIDE**2 + sum(self._charges[i] for i in chosen)
 
 
 def _extent(kept: NDArray[np.bool_]) -> slice:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.messages.digest import Glimpse
-from stages.perception.composition import Composition, glimpse, scene_cost, silhouette
+from stages.perception.composition import Composition, glimpse, scene_cost
 from stages.perception.likelihood import CostForm, ObservedScene, with_object
 from stages.perception.particle_filter import FilterSettings, ObjectFilter, Track, pixels
 from stages.perception.rasteriser import Float32s, inverse_depth
@@ -139,11 +139,6 @@ class SceneFilter:
             if len(self._costs) > self._memory:
                 self._costs.popitem(last=False)
         return cost
-
-    def charge(self, scene: ObservedScene, suspects: Sequence[Suspect], poses: Sequence[Floats]) -> float:
-        """The cost of all readings on the objects' silhouettes, hidden or not, were none of them explained."""
-        layers = (self._layer(scene, s, pose) for s, pose in zip(suspects, poses, strict=True))
-        return self._settings.cost.truncation * sum(silhouette(scene, layer) for layer in layers)
 
     def _sequence(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> list[Track]:
         share = self._settings.iterations // max(1, len(suspects))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.perception.combinations import cheapest
-from stages.perception.composition import STRIDE, Composition, FirstLook, glimpse, scene_cost
+from stages.perception.composition import STRIDE, Composition, FirstLook, charge, glimpse, scene_cost
 from stages.perception.likelihood import CostForm, Shape
 from stages.perception.poses import random_rotations
 from stages.perception.rasteriser import Float32s, inverse_depth
@@ -98,7 +98,7 @@ def test_an_object_cost_keeps_the_objects_and_drops_their_doubles(seen: Rendered
     layers += [layer(shapes, "tea_box", beside), layer(shapes, "mug", behind)]
     boxes += [boxes[1], boxes[1]]
     glimpses = [glimpse(seen.scene, *each, FORM) for each in zip(layers, boxes, strict=True)]
-    look = FirstLook(glimpses, object_cost=0.1, truncation=FORM.truncation)
+    look = FirstLook(glimpses, [charge([box], 0.1) for box in boxes])
     best = cheapest(look.cost, 5, None, 1)[0]
     assert best in {(0, 1, 2), (0, 2, 3)}
 
