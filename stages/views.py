@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from colorsys import hsv_to_rgb
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -298,10 +299,10 @@ def _particles(trace: ParticleTrace, iteration: int) -> Floats:
 def look_text(estimate: SceneEstimate) -> str:
     """The winning hypothesis in words, and how sure it is."""
     sure = "" if estimate.probabilities is None else f", probability {estimate.probabilities[estimate.winner]:.2f}"
-    title = f"### Hypothesis {estimate.winner + 1} of {len(estimate.log_weights)} wins{sure}"
+    title = f"**Hypothesis {estimate.winner + 1} of {len(estimate.log_weights)} wins{sure}**"
     notes = [f"{estimate.left_out} combinations were left out by the cap."] if estimate.left_out else []
     notes += [f"Something unknown: {_size(item)}, {item.points} readings." for item in estimate.unknown]
-    header = ["| object | sure | spread | fit | visible | |", "|---|---|---|---|---|---|"]
+    header = ["| object | sure | spread | fit | seen | |", "|---|---|---|---|---|---|"]
     return "\n".join([title, *(f"\n{note}" for note in notes), "", *header, *map(_look_row, estimate.objects)])
 
 
@@ -352,7 +353,7 @@ def _certainty(item: ObjectPose) -> Color:
 def doubt_drawings(estimate: SceneEstimate, catalogue: Catalogue) -> Iterator[Drawing]:
     """In space: other poses an object may have, as ghosts of its edges; what is contradicted or unknown, boxed."""
     for item in estimate.objects:
-        mesh = catalogue[item.label].simplified(GHOST_TRIANGLES)
+        mesh = _swollen(catalogue[item.label].simplified(GHOST_TRIANGLES))
         for number, other in enumerate(item.alternatives):
             strips = _edges(mesh, other.T_camera_object)
             yield Lines3D(f"world/camera/doubt/{item.name}_{number}", strips, _GHOST, radius=0.0006)
@@ -363,6 +364,12 @@ def doubt_drawings(estimate: SceneEstimate, catalogue: Catalogue) -> Iterator[Dr
     for number, region in enumerate(estimate.unknown):
         low, high = (region.centre_table + sign * region.extent_table / 2 for sign in (-1, 1))
         yield Lines3D(f"world/camera/doubt/unknown_{number}", _box_edges(low, high, estimate.T_camera_table), _MAGENTA)
+
+
+def _swollen(mesh: Mesh) -> Mesh:
+    """A little larger, so that an object turned round shows outside itself."""
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    return replace(mesh, vertices=middle + 1.03 * (mesh.vertices - middle))
 
 
 def _edges(mesh: Mesh, T: Floats) -> tuple[Floats, ...]:
