@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from benchmarks.baselines import icp, random_guess
+from benchmarks.baselines import fpfh, icp, perch, ppf, random_guess
 from benchmarks.baselines.common import Estimator
 
 METHODS: dict[str, Estimator] = {
     "icp": icp.estimate,
+    "fpfh": fpfh.estimate,
+    "ppf": ppf.estimate,
+    "perch": perch.estimate,
     "random": random_guess.estimate,
 }

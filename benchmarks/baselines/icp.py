@@ -36,7 +36,9 @@ def poses(box: Box, trained: None = None) -> Floats:
 def best(box: Box, begin: Floats) -> Floats:
     """Starts (P x 4 x 4) after ICP, the leaders best first by rendered-depth agreement."""
     readings = box.observed.inside(box.candidate)
-    scene = Grid.of(thinned(readings, _SOUGHT), voxel=0.008, margin=0.05)
+    # What lies a diameter in front of the middle or behind it belongs to no object in the box.
+    near = np.abs(readings[:, 2] - np.median(readings[:, 2])) < box.model.diameter
+    scene = Grid.of(thinned(readings[near], _SOUGHT), voxel=0.008, margin=0.05)
     basis = directions(box.dof, box.observed.T_camera_table)
     coarse = model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING)
     return refined(box, Crop.around(box.observed, box.candidate, 4).ranked(box.model.soup, coarse)[:_LEADERS])
@@ -66,9 +68,9 @@ def starts(box: Box) -> Floats:
 
 def rotations(T_camera_table: Floats, dof: int, yaws: int) -> Floats:
     """Orientations of an object that rests on one of its six faces (upright with 3 degrees of freedom), P x 3 x 3."""
-    tips: Floats = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
-    faces = exp_so3(np.pi / 2 * tips[: 1 if dof == 3 else 6])
-    turns = exp_so3(np.arange(yaws)[:, None] * (2 * np.pi / yaws) * np.array([0.0, 0.0, 1.0]))
+    tips = np.deg2rad([[0, 0, 0], [180, 0, 0], [90, 0, 0], [-90, 0, 0], [0, 90, 0], [0, -90, 0]])
+    faces = exp_so3(tips[: 1 if dof == 3 else 6])
+    turns = exp_so3(np.outer(np.linspace(0, 2 * np.pi, yaws, endpoint=False), [0.0, 0.0, 1.0]).astype(np.float64))
     return np.concatenate([T_camera_table[:3, :3] @ turns @ face for face in faces])
 
 
