@@ -36,6 +36,7 @@ from stages.perception.doubt import (
     cost_of_an_object,
     hypothesis_probabilities,
     judged,
+    standardised,
 )
 from stages.perception.likelihood import ObservedScene
 from stages.perception.metrics import pose_errors
@@ -208,7 +209,7 @@ def _fit_poses(train: Sequence[Scene], hypothesis: float, scale: float) -> tuple
     """Logistic regression with a small ridge; every weight keeps the sign that its evidence has."""
     X, right = design(train, hypothesis, scale)
     centres, scales = X.mean(0), np.maximum(X.std(0), 1e-3)
-    Z = (X - centres) / scales
+    Z = standardised(X, centres, scales)
     signs = np.array([_SIGNS[name] for name in FEATURES])
 
     def loss(parameters: Floats) -> tuple[float, Floats]:

@@ -53,6 +53,7 @@ _ABOUT = (np.deg2rad(60.0), 0.06)
 _KEPT = 4
 _LIKELY = 0.1
 """Alternatives kept at most, and the least weight that one has relative to the estimate."""
+_FARTHEST = 3.0
 _CAP = 12.0
 """Nats beyond which evidence is as good as any."""
 
@@ -89,8 +90,13 @@ class Calibration:
 
     def probability(self, features: Floats) -> float:
         """That a pose with these features is right."""
-        standard = (features - np.array(self.centres)) / np.array(self.scales)
+        standard = standardised(features, np.array(self.centres), np.array(self.scales))
         return float(1.0 / (1.0 + np.exp(-(self.bias + (standard * np.array(self.weights)).sum()))))
+
+
+def standardised(features: Floats, centres: Floats, scales: Floats) -> Floats:
+    """Features in deviations from their mean; bounded, so that a model never reaches far beyond what it has seen."""
+    return np.clip((features - centres) / scales, -_FARTHEST, _FARTHEST)
 
 
 @dataclass(frozen=True)
