@@ -28,7 +28,7 @@ _SCOUTS = 150
 _TILE = 4
 """Side of a patch in compared pixels: neighbours err together."""
 _LEAST_TILES = 6
-_SURE = 2.5
+_SURE = 2.0
 """Standard errors by which a pose's colours must fit better than the favourite's."""
 _LEAST = 0.3
 """Mean distance, CIELAB units, below which no difference counts."""
