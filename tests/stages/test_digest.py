@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import right_sets, score, table
-from benchmarks.datasets import Truth, read_truth
+from benchmarks.datasets import ImageId, Truth, read_truth
+from benchmarks.estimate import Settings, estimate, results
 from runner.contract import Finished, Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
@@ -152,6 +153,46 @@ def test_the_true_scene_outweighs_the_false_one(seen: Rendered, filter_stage: Pa
     assert posteriors[0].traces[0].positions.shape[1] == 4
 
 
+def test_a_posterior_depends_on_its_message_alone(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    false = ("sponge", seen.boxes["tea_box"], 0.99)
+    found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), false)
+    (observation, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=2), frame(seen), found, filter_stage)
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    replica = ParticleFilter(filter_stage.config)
+    again = [replica.on_hypothesis(h, observation, ctx) for h in reversed(hypotheses)][::-1]
+    assert len(hypotheses) == 3
+    assert [msgspec.msgpack.encode(p, enc_hook=np.ndarray.tobytes) for p in posteriors] == [
+        msgspec.msgpack.encode(p, enc_hook=np.ndarray.tobytes) for p in again
+    ]
+
+
+def test_the_number_of_objects_is_found(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    shifted = seen.boxes["mug"] + np.array([4.0, -3.0, 5.0, 2.0])
+    false = [("mug", shifted, 0.99), ("sponge", seen.boxes["tea_box"], 0.95)]
+    found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), *false)
+    config = Hypotheses.Config(n_objects="auto", finalists=4)
+    (observation, *hypotheses), ctx = enumerate_(config, frame(seen), found, filter_stage)
+    assert [h.left_out for h in hypotheses] == [12] * 4
+    assert "4 of 16 hypotheses, 12 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[0]
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert sorted(item.label for item in estimate.objects) == ["mug", "tea_box"]
+
+
+def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    bare = render({})
+    found = candidates(("mug", seen.boxes["mug"], 0.9))
+    config = Hypotheses.Config(n_objects="auto")
+    (observation, *hypotheses), ctx = enumerate_(config, frame(bare), found, filter_stage)
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    assert Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx).objects == ()
+
+
+def test_the_plain_form_cannot_find_the_number_of_objects(seen: Rendered) -> None:
+    with pytest.raises(Refused, match=r"auto, which particle_filter\.form paper cannot do; set a whole number"):
+        enumerate_(Hypotheses.Config(n_objects="auto"), frame(seen), both(seen))
+
+
 def test_an_empty_hypothesis_has_an_empty_scene(seen: Rendered, filter_stage: ParticleFilter) -> None:
     (observation, hypothesis), ctx = enumerate_(Hypotheses.Config(n_objects=4), frame(seen), candidates())
     posterior = filter_stage.on_hypothesis(hypothesis, observation, ctx)
@@ -258,3 +299,15 @@ def test_data_sets_with_exact_boxes(name: str, dof: Literal[3, 6], images: int) 
     assert np.mean([one.adds < 0.02 for one in scores]) >= 0.9
     if dof == 3:
         assert np.mean([one.within(0.02, 15) for one in scores]) >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "dof", "ids"), [("household-layout", 3, [(2, 0)]), ("clutter-ycb", 6, [(7, 0)])])
+def test_data_sets_with_noisy_boxes_and_the_number_unknown(name: str, dof: Literal[3, 6], ids: list[ImageId]) -> None:
+    dataset = DATA / name
+    if not dataset.exists():
+        pytest.skip("the data sets are not beside the repository (../shared/data)")
+    found = estimate(dataset, "noisy", Settings(dof=dof, n_objects="auto"), ids)
+    lines = [line for one in found for line in results(one, Catalogue.load(dataset / "models"))]
+    truths = [truth for truth in read_truth(dataset) if truth.image in ids]
+    assert right_sets(truths, lines) == (len(ids), len(ids))
