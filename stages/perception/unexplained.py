@@ -55,7 +55,8 @@ def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[R
     lonely = _opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
     count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
     found = [_region(scene, labels == number) for number in range(1, count)]
-    return tuple(sorted((region for region in found if region is not None), key=lambda region: -region.points))
+    # How components are numbered may depend on the number of threads; their order here must not.
+    return tuple(sorted(filter(None, found), key=lambda region: (-region.points, *region.box.tolist())))
 
 
 def looked_through(scene: ObservedScene, layer: Float32s, others: Float32s) -> float:
