@@ -53,7 +53,7 @@ def _milliseconds(run: Any, iterations: int) -> float:
     """Wall time per iteration, after a few that compile and warm up."""
     from stages.perception.cuda_math import cuda
 
-    run(3)
+    run(min(3, iterations))
     cuda.synchronize()
     start = time.perf_counter()
     run(iterations)
