@@ -41,6 +41,10 @@ class Settings:
     share: Literal["images", "hypotheses"] = "images"
     """``hypotheses`` is how a graph runs with replicas: right for timing one image after the other."""
 
+    def __post_init__(self) -> None:
+        if self.processes < 1:
+            raise Refused(f"processes = {self.processes}: must be at least 1")
+
 
 def estimate(
     dataset: Path, detections: Path | str, settings: Settings, wanted: Iterable[ImageId] | int | None = None
@@ -195,6 +199,7 @@ def _run(options: argparse.Namespace) -> int:
     chosen = list(images(options.dataset, detections_file(options.dataset, options.detections), wanted))
     catalogue = Catalogue.load(options.dataset / "models")
     found: list[Result] = []
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     with options.out.open("w") as file:
         file.write(HEADER + "\n")
         for image, one in zip(chosen, estimates(options.dataset, chosen, _settings(options)), strict=True):

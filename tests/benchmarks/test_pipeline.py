@@ -50,6 +50,9 @@ def test_settings_reach_every_stage_that_has_them() -> None:
     assert {config.form for config in configs if hasattr(config, "form")} == {"paper"}
     assert graph.nodes["particle_filter"].config.without == ("flips",)
     assert graph.nodes["hypotheses"].config.max_hypotheses == 4
+    assert bop_graph(LAYOUT, Settings(n_objects="auto")).nodes["hypotheses"].config.n_objects == "auto"
+    with pytest.raises(Refused, match="processes = 0: must be at least 1"):
+        Settings(processes=0)
 
 
 @needs_data

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.clutter import sheet
 from benchmarks.datasets import images, truths_by_image
 from stages.devices.bop import read_dataset
 from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, write_clutter
@@ -97,3 +98,9 @@ def test_twenty_scenes_show_104_objects_of_all_kinds() -> None:
 def test_the_data_set_is_one_of_bop(dataset: Path) -> None:
     assert [image.n_objects for image in read_dataset(dataset)] == list(COUNTS[:2])
     assert sorted(truths_by_image(dataset)) == [(1, 0), (2, 0)]
+
+
+def test_the_sheet_shows_every_image(dataset: Path) -> None:
+    pixels = np.asarray(sheet(dataset))
+    assert pixels.shape[0] == 195 and (pixels[:, :255].std(), pixels[:, 259:514].std()) > (1, 1)
+    assert (pixels[:, 514:] == 255).all()
