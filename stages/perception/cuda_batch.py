@@ -60,6 +60,7 @@ class Batch:
         words = max(self.launch.z_buffer_bytes // 4, widest)
         words = min(words, max(look.window.factor.size for look in looks))
         self._shared_bytes = 4 * (words + self.launch.threads)
+        self._room: list[Any] = []
 
     def write_costs(self, poses: Any, objects: Any, windows: Any, out: Any, *, stream: Any = 0) -> None:
         """Changes of cost, P, for poses P x 3 x 4 float32 of objects P and windows P (int32); all on the device.
@@ -72,13 +73,22 @@ class Batch:
 
     def costs(self, poses: Any, objects: Any, windows: Any) -> Float32s:
         """Changes of cost of poses given on the host, P."""
-        out = cuda.device_array(len(poses), np.float32)
-        to_device = cuda.to_device
-        self.write_costs(
-            to_device(np.ascontiguousarray(poses, np.float32)), to_device(np.asarray(objects, np.int32)),
-            to_device(np.asarray(windows, np.int32)), out,
-        )  # fmt: skip
-        return out.copy_to_host()
+        count = len(poses)
+        if count == 0:
+            return np.zeros(0, np.float32)
+        places = [array[:count] for array in self._buffers(count)]
+        for place, array in zip(places, (poses, objects, windows), strict=False):
+            place.copy_to_device(np.ascontiguousarray(array, place.dtype))
+        self.write_costs(*places)
+        return places[-1].copy_to_host()
+
+    def _buffers(self, count: int) -> list[Any]:
+        """Room on the device for poses, objects, windows and costs; to allocate it each time would cost more than the
+        kernel."""
+        if not self._room or len(self._room[0]) < count:
+            shapes = (((count, 3, 4), np.float32), (count, np.int32), (count, np.int32), (count, np.float32))
+            self._room = [cuda.device_array(*shape) for shape in shapes]
+        return self._room
 
 
 def change_of_cost_cuda(batch: Batch, poses: Any) -> Float32s:

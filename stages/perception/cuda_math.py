@@ -8,6 +8,7 @@ runs kernels as Python, the functions are what they are.
 
 from __future__ import annotations
 
+import warnings
 from types import FunctionType
 from typing import Any
 
@@ -20,6 +21,9 @@ cuda: Any = numba.cuda
 """numba.cuda, whose type information covers neither its launches nor its shared arrays."""
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)  # pyright: ignore
 """Whether kernels run as Python on the CPU: set NUMBA_ENABLE_CUDASIM=1 before Python starts."""
+
+# One block per particle or population is what the work has; numba warns of any grid below 128.
+warnings.filterwarnings("ignore", message="Grid size")
 
 if SIMULATED:
     ceil: Any = np.ceil
