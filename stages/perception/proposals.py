@@ -89,7 +89,7 @@ class Proposals:
         turning = np.abs(directions[:3]).sum(0) > 0
         steps = rng.normal(size=(len(poses), directions.shape[1])) * np.where(turning, radians, metres)
         twists = (directions[None] * steps[:, None, :]).sum(-1)
-        return self._turned(poses, exp_so3(twists[:, :3]), twists[:, 3:])
+        return _moved(np.ascontiguousarray(poses), self._centre, twists)
 
     def flipped(self, poses: Floats, T_camera_table: Floats, rng: np.random.Generator) -> Floats:
         """One flip each, drawn among those that the object's symmetries do not undo; with six degrees of freedom
@@ -149,6 +149,29 @@ class Proposals:
         along = (turned * readings[:, None]).sum(-1)
         nearest = turned[np.arange(len(turned)), np.argmin(along, 1)]
         return nearest + rotate(rotations, self._centre)
+
+
+@numba.njit(**KERNEL)
+def _moved(poses, centre, twists):  # pyright: ignore[reportMissingParameterType]
+    """Poses P x 3 x 4 after a turn about ``centre`` (object frame) and a shift, camera frame: twists P x 6."""
+    moved = np.empty_like(poses)
+    turn = np.empty((3, 3))
+    for p in range(poses.shape[0]):
+        x, y, z = twists[p, 0], twists[p, 1], twists[p, 2]
+        angle = np.sqrt(x * x + y * y + z * z) + 1e-12
+        x, y, z = x / angle, y / angle, z / angle
+        s, d = np.sin(angle), 1.0 - np.cos(angle)
+        turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - d * (y * y + z * z), d * x * y - s * z, d * x * z + s * y
+        turn[1, 0], turn[1, 1], turn[1, 2] = d * x * y + s * z, 1.0 - d * (x * x + z * z), d * y * z - s * x
+        turn[2, 0], turn[2, 1], turn[2, 2] = d * x * z - s * y, d * y * z + s * x, 1.0 - d * (x * x + y * y)
+        for i in range(3):
+            position = poses[p, i, 3] + twists[p, 3 + i]
+            for j in range(3):
+                rotated = turn[i, 0] * poses[p, 0, j] + turn[i, 1] * poses[p, 1, j] + turn[i, 2] * poses[p, 2, j]
+                moved[p, i, j] = rotated
+                position += (poses[p, i, j] - rotated) * centre[j]
+            moved[p, i, 3] = position
+    return moved
 
 
 def box_axes(vertices: Floats) -> Floats:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.perception.poses import exp_so3, rotate, rotation_angle
+from stages.perception.poses import compose, exp_so3, rotate, rotation_angle
 from stages.perception.proposals import Guess, Proposals, box_axes, distinct_best
 from tests.stages.perception.scenes import CATALOGUE, camera
 
@@ -29,6 +29,18 @@ def test_upright_guesses_stand_on_the_table() -> None:
 def test_some_guesses_rest_and_some_do_not() -> None:
     poses = Proposals(CATALOGUE["mug"], 6).initial(READINGS, 400, np.random.default_rng(1))
     assert 0.1 < (np.abs(heights(poses, "mug")) < 1e-9).mean() < 0.6
+
+
+def test_diffusion_turns_about_the_centre_and_shifts() -> None:
+    rng, label = np.random.default_rng(3), "mug"
+    proposals, centre = Proposals(CATALOGUE[label], 6), CATALOGUE[label].bounds.mean(0)
+    poses = np.concatenate([exp_so3(rng.normal(size=(500, 3))), rng.normal(0, 0.1, (500, 3))[..., None]], -1)
+    moved = proposals.diffuse(poses, np.eye(6), metres=0.02, radians=0.3, rng=np.random.default_rng(4))
+    twists = np.random.default_rng(4).normal(size=(500, 6)) * np.repeat([0.3, 0.02], 3)
+    expected = compose(exp_so3(twists[:, :3]), poses[:, :, :3])
+    assert moved[:, :, :3] == pytest.approx(expected, abs=1e-12)
+    shift = rotate(moved[:, :, :3], centre) + moved[:, :, 3] - rotate(poses[:, :, :3], centre) - poses[:, :, 3]
+    assert shift == pytest.approx(twists[:, 3:], abs=1e-12)
 
 
 @given(vector=st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3), size=st.permutations([0.03, 0.075, 0.11]))
