@@ -8,6 +8,7 @@ prints the reliability of the second.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -366,8 +367,10 @@ def write_constants(constants: Calibration, path: Path, command: str) -> None:
 
 
 def generate(folder: Path, name: str, count: int) -> None:
-    """Renders a set of scenes, unless it is there."""
-    if not (folder / name / "detections_noisy.json").is_file():
+    """Renders a set of scenes, unless as many are there."""
+    targets = folder / name / "test_targets_bop19.json"
+    there = {item["scene_id"] for item in json.loads(targets.read_text())} if targets.is_file() else set[int]()
+    if len(there) < count:
         print(f"rendering {count} {name} scenes", flush=True)
         write_clutter(folder / name, Catalogue.load(_CATALOGUE), scenes=count, seed=_SEEDS[name])
 
@@ -376,8 +379,8 @@ def main() -> None:
     """Fits and evaluates."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where scenes and estimates are kept; empty it to begin anew")
-    parser.add_argument("--exact", type=int, default=40, help="scenes of each set estimated from exact boxes")
-    parser.add_argument("--noisy", type=int, default=20, help="scenes of each set estimated from noisy boxes")
+    parser.add_argument("--exact", type=int, default=80, help="scenes of each set estimated from exact boxes")
+    parser.add_argument("--noisy", type=int, default=30, help="scenes of each set estimated from noisy boxes")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--evaluate", action="store_true", help="keep the constants that are there")
     options = parser.parse_args()
