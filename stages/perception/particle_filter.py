@@ -268,14 +268,16 @@ class _Population:
         return poses
 
     def around(self, pose: Floats, phase: _Phase) -> Floats:
-        """A small generation about a known pose: it, some noise and the better ones of new guesses."""
+        """A small generation about a known pose: it, the best of its surroundings and of new guesses, these polished."""
         near = np.repeat(pose[None], self._settings.particles // 8, 0)
-        near = self._proposals.diffuse(near, phase.directions, metres=0.008, radians=np.deg2rad(8.0), rng=self._rng)
+        near = self._proposals.diffuse(near, phase.directions, metres=0.008, radians=np.deg2rad(15.0), rng=self._rng)
         fresh = self._proposals.initial(self._guess, _FRESH * self._settings.particles, self._rng)
-        cheap = distinct_best(fresh, phase.likelihood.energies(fresh), 32, metres=0.01, radians=np.deg2rad(15.0))
-        return np.concatenate(
-            [pose[None], near, phase.likelihood.refine(fresh[cheap], phase.directions, steps=4, gate=0.03)]
-        )
+        poses = np.concatenate([pose[None], near, fresh])
+        cheap = distinct_best(poses, phase.likelihood.energies(poses), 40, metres=0.006, radians=np.deg2rad(10.0))
+        nearby = np.concatenate([pose[None], poses[cheap]])
+        if not self._settings.polished:
+            return nearby
+        return np.concatenate([nearby, phase.likelihood.refine(poses[cheap], phase.directions, steps=4, gate=0.03)])
 
     def finish(self, poses: Floats, coarse: _Phase, phase: _Phase) -> Track:
         """The particle of least cost (equation 10), after polish where that lowers its cost further."""
