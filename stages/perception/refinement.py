@@ -26,6 +26,8 @@ from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 _GAIN = 5e-6
 """Metres per visible pixel by which a moved object must lower the scene's cost."""
+_LOYAL = 0.2
+"""Share of what counts as equal by which a flip must be cheaper to be depth's favourite, not the present pose."""
 _SAME = np.deg2rad(12.0)
 """Two poses closer than this, modulo symmetry, are one."""
 _ROUGH = 3
@@ -243,14 +245,14 @@ class _Joint:
         """Depth's favourite, then the poses that depth finds equal to it, cheapest first, and what they cost.
 
         They are the present pose and its polished flips, no two the same modulo the object's symmetries. The present
-        one is the favourite where it is hardly dearer than the cheapest.
+        one is the favourite unless another is cheaper by a fifth of what counts as equal.
         """
         flips = self._flips(i, place)
         present = self._totals(i, place, self._poses[i][None])
         flips = flips[place.likelihood.costs(flips) <= present[0] + place.equal]
         poses = np.concatenate([self._poses[i][None], flips])
         totals = np.concatenate([present, self._totals(i, place, flips)])
-        ranks = totals - _GAIN * place.visible * (np.arange(len(totals)) == 0)
+        ranks = totals - _LOYAL * place.equal * (np.arange(len(totals)) == 0)
         kept = _distinct(poses, ranks, self._models[i].item.symmetries.transforms())
         kept = [k for k in kept if totals[k] <= totals.min() + place.equal]
         return poses[kept], totals[kept]
