@@ -9,7 +9,14 @@ from typing import Literal
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Candidates, Frame, Hypothesis, Observation
 from stages.messages.digest import Glimpse, Placed, Prospect, Sighting, Start
-from stages.perception.combinations import cheapest, count_combinations, count_subsets, most_confident, ordered
+from stages.perception.combinations import (
+    additions_first,
+    cheapest,
+    count_combinations,
+    count_subsets,
+    most_confident,
+    ordered,
+)
 from stages.perception.composition import FirstLook, charge
 from stages.perception.preprocessing import preprocess
 
@@ -88,8 +95,10 @@ class Hypotheses(Stage):
     ) -> Iterator[Hypothesis]:  # fmt: skip
         object_cost = 0.0 if number is not None else OBJECT_COST
         look = FirstLook(glimpses, [charge([candidate.box], object_cost) for candidate in candidates])
-        combinations = cheapest(look.cost, len(candidates), number, self.config.finalists)
-        left_out = count_subsets(len(candidates), number) - len(combinations)
+        h = count_subsets(len(candidates), number)
+        ranked = cheapest(look.cost, len(candidates), number, h)
+        combinations = (ranked if number is not None else additions_first(ranked))[: self.config.finalists]
+        left_out = h - len(combinations)
         if left_out:
             ctx.log(_left_out(len(combinations), left_out, "dearest at first look", "finalists"))
         incumbent = tuple(

@@ -48,6 +48,17 @@ def cheapest(cost: Callable[[Indices], float], m: int, n_objects: int | None, li
     return [indices for _, indices in sorted(found if n_objects is None else level)[:limit]]
 
 
+def additions_first(ranked: list[Indices]) -> list[Indices]:
+    """The first combination, then those that add one candidate to it, then the others; order kept otherwise.
+
+    An object that alone took another's place explains nothing while that one is there too. It finds its own only once
+    both are estimated together, so where any number may be right each addition to the best deserves that.
+    """
+    best = set(ranked[0])
+    added = [chosen for chosen in ranked if len(chosen) == len(best) + 1 and best < set(chosen)]
+    return list(dict.fromkeys([ranked[0], *added, *ranked]))
+
+
 def _by_cost(cost: Callable[[Indices], float], subsets: set[Indices]) -> list[tuple[float, Indices]]:
     return sorted((cost(indices), indices) for indices in subsets)
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.messages import Candidate
-from stages.perception.combinations import cheapest, count_combinations, count_subsets, most_confident
+from stages.perception.combinations import additions_first, cheapest, count_combinations, count_subsets, most_confident
 
 
 def candidates(*confidences: float) -> list[Candidate]:
@@ -57,3 +57,9 @@ def test_many_candidates_are_searched_with_a_beam() -> None:
     best = cheapest(cost, 40, 6, 1)[0]
     assert best == tuple(sorted(np.argsort(-worth)[:6].tolist()))
     assert asked < 60_000
+
+
+def test_additions_to_the_best_come_first() -> None:
+    ranked = [(1, 2), (1,), (0, 1), (1, 2, 3), (0, 2), (0, 1, 2), ()]
+    assert additions_first(ranked) == [(1, 2), (1, 2, 3), (0, 1, 2), (1,), (0, 1), (0, 2), ()]
+    assert additions_first([()]) == [()]
