@@ -47,12 +47,15 @@ from stages.scene.catalogue import Catalogue, Floats
 _ROOT = Path(__file__).parents[1]
 _CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
 _PLOT = _ROOT / "docs" / "figures" / "reliability.png"
-_SEEDS = {"train": 1001, "test": 2002}
+_SEEDS = {"train": 1001, "test": 3003}
 """Of the scenes; Clutter-15 has seed 0."""
 _POSE_SCALES = (20.0, 60.0, 180.0)
 _SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1), strict=True))
 """Which way evidence points: a fit to few scenes must not turn it round."""
 _RIDGE = 1.0
+_PRIOR = {"margin": 0.5, "fit": -1.0, "gain": 1.0, "looked through": -1.0}
+"""Weights that the ridge pulls towards: log-odds of half the margin, which is what its theory says, tempered; and one
+nat per deviation for an object that does not fit its readings. Few scenes show a pose that is certain and wrong."""
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
 
 
@@ -207,20 +210,23 @@ def _fit_hypotheses(train: Sequence[Scene]) -> float:
 
 
 def _fit_poses(train: Sequence[Scene], hypothesis: float, scale: float) -> tuple[Calibration, float]:
-    """Logistic regression with a small ridge; every weight keeps the sign that its evidence has."""
+    """Logistic regression with a ridge about a prior; every weight keeps the sign of its evidence."""
     X, right = design(train, hypothesis, scale)
-    centres, scales = X.mean(0), np.maximum(X.std(0), 1e-3)
+    centres, scales = X.mean(0), np.maximum(X.std(0), 0.1)
+    centres[0], scales[0] = 0.0, 1.0  # the margin is in log-odds already
     Z = standardised(X, centres, scales)
     signs = np.array([_SIGNS[name] for name in FEATURES])
+    prior = np.array([0.0, *(_PRIOR.get(name, 0.0) for name in FEATURES)])
 
     def loss(parameters: Floats) -> tuple[float, Floats]:
         logits = parameters[0] + (Z * parameters[1:]).sum(1)
         residual = 1 / (1 + np.exp(-logits)) - right
-        value = np.logaddexp(0.0, np.where(right, -logits, logits)).sum() + 0.5 * _RIDGE * (parameters[1:] ** 2).sum()
-        return float(value), np.append(residual.sum(), (Z * residual[:, None]).sum(0) + _RIDGE * parameters[1:])
+        off = parameters - prior
+        value = np.logaddexp(0.0, np.where(right, -logits, logits)).sum() + 0.5 * _RIDGE * (off**2).sum()
+        return float(value), np.append(residual.sum(), (Z * residual[:, None]).sum(0)) + _RIDGE * off
 
     bounds = [(None, None), *((0, None) if sign > 0 else (None, 0) for sign in signs)]
-    found = minimize(loss, np.zeros(1 + len(FEATURES)), jac=True, bounds=bounds, method="L-BFGS-B")
+    found = minimize(loss, prior, jac=True, bounds=bounds, method="L-BFGS-B")
     weights = found.x[1:]
     constants = Calibration(
         hypothesis_scale=hypothesis,

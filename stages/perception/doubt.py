@@ -95,8 +95,12 @@ class Calibration:
 
 
 def standardised(features: Floats, centres: Floats, scales: Floats) -> Floats:
-    """Features in deviations from their mean; bounded, so that a model never reaches far beyond what it has seen."""
-    return np.clip((features - centres) / scales, -_FARTHEST, _FARTHEST)
+    """Features in deviations from their mean; bounded, so that a model never reaches far beyond what it has seen.
+
+    The margin, which comes first, has bounds of its own.
+    """
+    bounds = np.append(np.inf, np.full(len(FEATURES) - 1, _FARTHEST))
+    return np.clip((features - centres) / scales, -bounds, bounds)
 
 
 @dataclass(frozen=True)
@@ -346,8 +350,8 @@ class _Look:
             visible=visible,
             gain=gain,
             looked_through=looked_through(self._scene, self._layer, self._others),
-            spread_metres=constants.spread_scale * max(near_metres, wide_metres),
-            spread_radians=constants.spread_scale * max(near_radians, wide_radians),
+            spread_metres=max(constants.spread_scale * near_metres, wide_metres),
+            spread_radians=max(constants.spread_scale * near_radians, wide_radians),
             hypothesis=hypothesis,
             confidence=item.confidence,
         )
