@@ -25,9 +25,19 @@ BOX = upright("tea_box", 0.0, 0.0, 0.6)
 HIDDEN_HANDLE, SHOWN_HANDLE = upright("mug", 0.0, 0.0, np.pi / 2), upright("mug", 0.0, 0.0, -0.9)
 
 
+PLAUSIBLE = Calibration(
+    hypothesis_scale=0.05, pose_scale=40.0, spread_scale=1.0, bias=0.5,
+    weights=(0.6, -0.5, 0.0, 0.5, -0.5, -0.3, 0.3, 0.1),
+    centres=(0.0, -6.3, 7.0, 0.8, 0.0, -1.5, 2.0, 0.8),
+    scales=(1.0, 0.4, 0.8, 0.2, 0.1, 0.8, 2.0, 0.2),
+)  # fmt: skip
+"""What tests judge with, whatever was fitted last."""
+
+
 def assess(seen: Rendered, poses: dict[str, Floats] | None = None, *, dof: int = 6) -> SceneDoubt:
     judged = [Judged(label, T, 0.9) for label, T in (poses or seen.poses).items()]
-    return Judge(CATALOGUE, dof=3 if dof == 3 else 6).assess(seen.scene, judged, np.array([-1.0, -3.0, -9.0]), 0)
+    judge = Judge(CATALOGUE, dof=3 if dof == 3 else 6, calibration=PLAUSIBLE)
+    return judge.assess(seen.scene, judged, np.array([-1.0, -3.0, -9.0]), 0)
 
 
 @pytest.mark.parametrize("dof", [3, 6])
@@ -65,7 +75,9 @@ def test_colour_settles_what_depth_cannot_see() -> None:
     T = seen.poses["soup_can"]
     flipped = (T @ pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3)))[:3]
     before, after = (
-        Judge(CATALOGUE, dof=6).assess(seen.scene, [Judged("soup_can", T, 0.9, rivals)], np.zeros(1), 0).objects[0]
+        Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE)
+        .assess(seen.scene, [Judged("soup_can", T, 0.9, rivals)], np.zeros(1), 0)
+        .objects[0]
         for rivals in ((), (Rival(flipped, colour=5.0),))
     )
     assert after.probability > before.probability and after.evidence.margin > before.evidence.margin + 3
@@ -134,8 +146,21 @@ def test_equal_scenes_are_judged_with_equal_bytes() -> None:
 
 
 def test_an_empty_scene_is_judged_too() -> None:
-    doubt = Judge(CATALOGUE, dof=6).assess(render({"tea_box": BOX}).scene, [], np.zeros(1), 0)
+    doubt = Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE).assess(render({"tea_box": BOX}).scene, [], np.zeros(1), 0)
     assert doubt.objects == () and doubt.probabilities.tolist() == [1.0] and len(doubt.unknown) == 1
+
+
+def test_the_fitted_constants_tell_what_is_sure_from_what_is_not() -> None:
+    judge = Judge(CATALOGUE, dof=6)
+    chances = {
+        name: judge.assess(seen.scene, [Judged(label, seen.poses[label], 0.9)], np.zeros(1), 0).objects[0].probability
+        for name, label, seen in (
+            ("box", "tea_box", render({"tea_box": BOX})),
+            ("hidden", "mug", render({"mug": HIDDEN_HANDLE})),
+            ("shown", "mug", render({"mug": SHOWN_HANDLE})),
+        )
+    }
+    assert chances["box"] > 0.9 and chances["shown"] > 0.9 > chances["hidden"]
 
 
 def test_better_evidence_is_never_less_sure() -> None:
