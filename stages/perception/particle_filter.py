@@ -268,7 +268,7 @@ class _Population:
         return poses
 
     def around(self, pose: Floats, phase: _Phase) -> Floats:
-        """A small generation about a known pose: the best of its surroundings and of new guesses, and these polished."""
+        """A small generation about a known pose: the best of its surroundings and of new guesses, polished too."""
         near = np.repeat(pose[None], self._settings.particles // 8, 0)
         near = self._proposals.diffuse(near, phase.directions, metres=0.008, radians=np.deg2rad(15.0), rng=self._rng)
         fresh = self._proposals.initial(self._guess, _FRESH * self._settings.particles, self._rng)
