@@ -1,8 +1,9 @@
 """Multi-start ICP: point-to-plane from 12 yaws of 6 resting faces in each box, best by rendered-depth agreement.
 
-The starts put the middle of the side that the object shows at the box's median depth (Besl and McKay 1992; Chen and
-Medioni 1992 for the distance to the plane). The gate of ICP falls from 10 cm to 1.5 cm while points of the model seek
-readings; the best twelve are refined with all readings seeking the model, the gate falling to 6 mm.
+The starts put the middle of the side that the object shows at the median and at two greater depths of the box, since
+what hides an object lies in front of it (Besl and McKay 1992; Chen and Medioni 1992 for the distance to the plane).
+The gate of ICP falls from 10 cm to 1.5 cm while points of the model seek readings, then to 6 mm while readings seek
+the model. Every start is refined to the end before one is chosen.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ from stages.perception.poses import exp_so3
 from stages.scene.catalogue import Floats
 
 _YAWS = 12
-_COARSE = np.linspace(0.1, 0.015, 16)
+_DEPTHS = (50, 75, 90)
+"""Percentiles of the readings in the box."""
+_COARSE = np.linspace(0.1, 0.015, 24)
 _FINE = np.linspace(0.015, 0.006, 20)
 """Gates, metres."""
 _SOUGHT = 3000
-_SEEKING = 500
+_SEEKING = 1000
 """Readings and model points of the coarse iterations."""
 _READINGS = 1500
 """Readings of the fine iterations."""
-_LEADERS = 12
 
 
 def poses(box: Box, trained: None = None) -> Floats:
@@ -34,14 +36,13 @@ def poses(box: Box, trained: None = None) -> Floats:
 
 
 def best(box: Box, begin: Floats) -> Floats:
-    """Starts (P x 4 x 4) after ICP, the leaders best first by rendered-depth agreement."""
+    """Starts (P x 4 x 4) after coarse and fine ICP, best first by rendered-depth agreement."""
     readings = box.observed.inside(box.candidate)
     # What lies a diameter in front of the middle or behind it belongs to no object in the box.
     near = np.abs(readings[:, 2] - np.median(readings[:, 2])) < box.model.diameter
     scene = Grid.of(thinned(readings[near], _SOUGHT), voxel=0.008, margin=0.05)
     basis = directions(box.dof, box.observed.T_camera_table)
-    coarse = model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING)
-    return refined(box, Crop.around(box.observed, box.candidate, 4).ranked(box.model.soup, coarse)[:_LEADERS])
+    return refined(box, model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING))
 
 
 def refined(box: Box, begin: Floats) -> Floats:
@@ -53,16 +54,17 @@ def refined(box: Box, begin: Floats) -> Floats:
 
 
 def starts(box: Box) -> Floats:
-    """Every yaw of every face the object may rest on, the side it shows at the box's median depth, P x 4 x 4."""
+    """Every yaw of every face the object may rest on, the side it shows at each of the box's depths, P x 4 x 4."""
     view, T_camera_table = box.observed.view, box.observed.T_camera_table
     middle = (box.candidate.box[:2] + box.candidate.box[2:]) / 2
     ray = np.array([(middle[0] - view.cx) / view.fx, (middle[1] - view.cy) / view.fy, 1.0])
-    target = ray * np.median(box.observed.inside(box.candidate)[:, 2])
+    depths = np.percentile(box.observed.inside(box.candidate)[:, 2], _DEPTHS)
     turns = rotations(T_camera_table, box.dof, _YAWS)
-    begin = np.tile(np.eye(4), (len(turns), 1, 1))
-    begin[:, :3, :3] = turns
-    for T in begin:
-        T[:3, 3] = target - T[:3, :3] @ _shown(box.model, ray @ T[:3, :3])
+    shown = np.stack([R @ _shown(box.model, ray @ R) for R in turns])
+    begin = np.tile(np.eye(4), (len(depths), len(turns), 1, 1))
+    begin[:, :, :3, :3] = turns
+    begin[:, :, :3, 3] = depths[:, None, None] * ray - shown
+    begin = begin.reshape(-1, 4, 4)
     return on_plane(begin, box.model, T_camera_table) if box.dof == 3 else begin
 
 

@@ -18,12 +18,12 @@ Region = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""
 _MAX_HEIGHT = 0.6
 """Metres above the support plane; what the main job takes as well."""
-_TOLERANCE = 0.015
+_TOLERANCE = 0.01
 """Metres between rendered and observed depth within which a pixel agrees."""
 _VIOLATION = 1.0
-"""What a pixel takes away where the sensor looks through the rendered surface."""
-_HIDDEN = 0.2
-"""What a pixel takes away where something in front hides the rendered surface."""
+"""What a pixel takes away where the sensor looks through the rendered surface, or where that is below the table."""
+_HIDDEN = 0.1
+"""What a pixel takes away where an object in front hides the rendered surface."""
 _STRAY = 0.5
 """What an agreeing pixel takes away outside the object's own box."""
 _SLACK = 0.1
@@ -83,6 +83,8 @@ class Crop:
     depth: Float32s
     gain: Floats
     """What a pixel that agrees is worth: 1 for foreground in the box, less outside, 0 for the table."""
+    hiding: Floats
+    """What a pixel that hides the rendered surface takes away: little for foreground, more for the table."""
 
     @staticmethod
     def whole(observed: Observed, stride: int) -> Crop:
@@ -101,18 +103,20 @@ class Crop:
     def _cut(observed: Observed, region: Region, stride: int, gain: Floats) -> Crop:
         x0, y0, x1, y1 = region
         part = np.s_[y0:y1:stride, x0:x1:stride]
-        return Crop(observed.view.sampled(*region, stride), observed.depth[part], gain[part])
+        hiding = np.where(observed.foreground[part], _HIDDEN, _VIOLATION)
+        return Crop(observed.view.sampled(*region, stride), observed.depth[part], gain[part], hiding)
 
     def agreement(self, inverse: Float32s) -> float:
         """Rendered-depth agreement: pixels that agree with their reading, less those that contradict it.
 
-        ``inverse`` is the rendered inverse depth. A pixel agrees by 1 - (d / 15 mm)^2; it contradicts fully where
-        the reading lies behind the rendered surface, and a little where it lies in front (something hides it).
+        ``inverse`` is the rendered inverse depth. A pixel agrees by 1 - (d / 10 mm)^2; it contradicts fully where
+        the reading lies behind the rendered surface or is of the table and lies in front, and a little where another
+        object lies in front (it hides the surface).
         """
         shown = (inverse > 0) & (self.depth > 0)
         behind = self.depth[shown] - 1.0 / inverse[shown]
         near = (1.0 - (behind / _TOLERANCE) ** 2) * self.gain[shown]
-        far = np.where(behind > 0, -_VIOLATION, -_HIDDEN)
+        far = np.where(behind > 0, -_VIOLATION, -self.hiding[shown])
         return float(np.where(np.abs(behind) < _TOLERANCE, near, far).sum())
 
     def ranked(self, soup: Soup, poses: Floats) -> Floats:

@@ -5,7 +5,7 @@ nearest first, is searched exhaustively, conditioned on those before it: a grid 
 for each of its six faces (upright with 3 degrees of freedom), z from what carries it (the table or the top of an
 object before). The grid is ranked with a tolerance of half a cell, the best 100 poses are refined by ICP, as PERCH
 refines its states, and the one of least cost at 5 mm wins. For wrong boxes every set would have to be searched again:
-the boxes are searched once, and the set of least cost by rendered-depth agreement is kept.
+the boxes are searched once, and the set of best rendered-depth agreement is kept.
 """
 
 from __future__ import annotations
@@ -155,48 +155,54 @@ def two_sided(rendered, placed, points, foreground, rays, T, extent, near):  # p
     A pixel whose reading lies 5 cm in front, or where an object before is nearer, counts for nothing.
     """
     cost = 0.0
-    height, width = rendered.shape
-    place = np.empty(3)
-    for v in range(height):
-        for u in range(width):
-            q = rendered[v, u]
-            if q > 0 and q > placed[v, u]:
-                z = points[v, u, 2]
-                hidden = 0 < z < 1.0 / q - _OCCLUDER
-                if z > 0 and not hidden and not _has_reading(rays[v, u] / q, points, v, u, near):
-                    cost += 1.0
-            if foreground[v, u] > 0 and placed[v, u] == 0:
-                for i in range(3):
-                    place[i] = 0.0
-                    for j in range(3):
-                        place[i] += T[j, i] * (points[v, u, j] - T[j, 3])
-                inside = True
-                for i in range(3):
-                    inside &= extent[0, i] < place[i] < extent[1, i]
-                if inside and not _has_rendered(points[v, u], rendered, rays, v, u, near):
-                    cost += 1.0
+    for v in range(rendered.shape[0]):
+        for u in range(rendered.shape[1]):
+            q, z = rendered[v, u], points[v, u, 2]
+            if q > 0 and q > placed[v, u] and z > 0 and z >= 1.0 / q - _OCCLUDER:
+                cost += 0.0 if _has_reading(rays, 1.0 / q, points, v, u, near) else 1.0
+            if foreground[v, u] > 0 and placed[v, u] == 0 and _encloses(T, extent, points, v, u):
+                cost += 0.0 if _has_rendered(points, rendered, rays, v, u, near) else 1.0
     return cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _has_reading(place, points, v, u, near):  # pyright: ignore
+def _encloses(T, extent, points, v, u):  # pyright: ignore
+    """Whether a reading lies in the enclosing box of the object at T."""
+    x, y, z = points[v, u, 0] - T[0, 3], points[v, u, 1] - T[1, 3], points[v, u, 2] - T[2, 3]
+    inside = True
+    for i in range(3):
+        inside &= extent[0, i] < T[0, i] * x + T[1, i] * y + T[2, i] * z < extent[1, i]
+    return inside
+
+
+@numba.njit(cache=True, nogil=True)
+def _has_reading(rays, z, points, v, u, near):  # pyright: ignore  # noqa: PLR0917
+    """Whether a reading lies within ``near`` of the rendered point of a pixel, among the pixels around it."""
     for y in range(max(0, v - 1), min(points.shape[0], v + 2)):
         for x in range(max(0, u - 1), min(points.shape[1], u + 2)):
-            gap = points[y, x] - place
-            if points[y, x, 2] > 0 and gap @ gap < near * near:
+            if points[y, x, 2] > 0 and _squared(points, y, x, rays, v, u, z) < near * near:
                 return True
     return False
 
 
 @numba.njit(cache=True, nogil=True)
-def _has_rendered(place, rendered, rays, v, u, near):  # pyright: ignore  # noqa: PLR0917
+def _has_rendered(points, rendered, rays, v, u, near):  # pyright: ignore  # noqa: PLR0917
+    """Whether a rendered point lies within ``near`` of a pixel's reading, among the pixels around it."""
     for y in range(max(0, v - 1), min(rendered.shape[0], v + 2)):
         for x in range(max(0, u - 1), min(rendered.shape[1], u + 2)):
-            if rendered[y, x] > 0:
-                gap = rays[y, x] / rendered[y, x] - place
-                if gap @ gap < near * near:
-                    return True
+            if rendered[y, x] > 0 and _squared(points, v, u, rays, y, x, 1.0 / rendered[y, x]) < near * near:
+                return True
     return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _squared(points, v, u, rays, y, x, z):  # pyright: ignore  # noqa: PLR0917
+    """Squared distance from the reading at (u, v) to the point of depth z at (x, y)."""
+    total = 0.0
+    for i in range(3):
+        gap = points[v, u, i] - rays[y, x, i] * z
+        total += gap * gap
+    return total
 
 
 estimate = Perch()

@@ -1,7 +1,7 @@
 """Point pair features (Drost et al. 2010) as OpenCV contrib implements them, then ICP.
 
 The detector's usual parameters: model sampled and distances quantised at 0.05 of the diameter, 30 angles, every fifth
-point of the scene a reference; readings are sampled at the model's step. Of the clusters with most votes the best 12
+point of the scene a reference; readings are sampled at the model's step. Of the clusters with most votes the best 50
 are refined by ICP and ranked by rendered-depth agreement.
 """
 
@@ -21,7 +21,7 @@ from stages.scene.catalogue import Floats
 _STEP = 0.05
 _ANGLES = 30
 _REFERENCES = 1 / 5
-_LEADERS = 12
+_LEADERS = 50
 _MILLIMETRES = 1000.0
 
 

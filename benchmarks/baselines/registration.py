@@ -128,83 +128,139 @@ def thinned(points: Floats, count: int) -> Floats:
 def _align(seekers, targets, normals, nearest, origin, voxel, by_reading, centre, poses, gates, basis):  # pyright: ignore  # noqa: PLR0917
     """Gauss-Newton steps for each pose, in place."""
     dof = basis.shape[1]
-    A = np.zeros((dof, dof))
-    b = np.zeros(dof)
-    for pose in poses:
+    A, b, step, twist = np.zeros((dof, dof)), np.zeros(dof), np.zeros(dof), np.zeros(6)
+    for p in range(len(poses)):
+        pose = poses[p]
         for gate in gates:
-            A[:] = 0.0
-            b[:] = 0.0
+            for i in range(dof):
+                b[i] = 0.0
+                for j in range(dof):
+                    A[i, j] = 0.0
             used = _accumulate(seekers, targets, normals, nearest, origin, voxel, by_reading, centre, pose, gate,
                                basis, A, b)  # fmt: skip
             if used < 10:
                 break
-            for i in range(dof):
-                A[i, i] += 1e-3 * A[i, i] + 1e-6
-            _move(pose, centre, basis @ np.linalg.solve(A, b))
+            _solve(A, b, step)
+            for i in range(6):
+                twist[i] = 0.0
+                for j in range(dof):
+                    twist[i] += basis[i, j] * step[j]
+            _move(pose, centre, twist)
 
 
 @numba.njit(cache=True, nogil=True)
 def _accumulate(seekers, targets, normals, nearest, origin, voxel, by_reading, centre, pose, gate, basis, A, b):  # pyright: ignore  # noqa: PLR0917
     """Normal equations of n . (reading - model point), robustly weighted; returns how many pairs took part."""
     used = 0
-    row = np.zeros(basis.shape[1])
-    twist = np.zeros(6)
-    R, t = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
-    inverse = np.ascontiguousarray(R.T)
-    middle = R @ centre + t
+    row, twist = np.zeros(basis.shape[1]), np.zeros(6)
+    mx, my, mz = _placed(pose, centre[0], centre[1], centre[2])
     for k in range(len(seekers)):
-        place = inverse @ (seekers[k] - t) if by_reading else R @ seekers[k] + t
-        index = _nearest(place, nearest, origin, voxel)
+        sx, sy, sz = seekers[k, 0], seekers[k, 1], seekers[k, 2]
+        if by_reading:
+            x, y, z = _turned_back(pose, sx - pose[0, 3], sy - pose[1, 3], sz - pose[2, 3])
+        else:
+            x, y, z = _placed(pose, sx, sy, sz)
+        index = _nearest(x, y, z, nearest, origin, voxel)
         if index < 0:
             continue
-        reading = seekers[k] if by_reading else targets[index]
-        n = R @ normals[index if by_reading else k]
-        gap = reading - (R @ targets[index] + t if by_reading else place)
-        if n @ reading > 0 or gap @ gap > gate * gate:
+        tx, ty, tz = targets[index, 0], targets[index, 1], targets[index, 2]
+        n = index if by_reading else k
+        nx, ny, nz = _turned(pose, normals[n, 0], normals[n, 1], normals[n, 2])
+        if by_reading:
+            rx, ry, rz = sx, sy, sz
+            x, y, z = _placed(pose, tx, ty, tz)
+        else:
+            rx, ry, rz = tx, ty, tz
+        gx, gy, gz = rx - x, ry - y, rz - z
+        if nx * rx + ny * ry + nz * rz > 0 or gx * gx + gy * gy + gz * gz > gate * gate:
             continue
-        residual = n @ gap
-        arm = reading - middle
-        twist[0] = arm[1] * n[2] - arm[2] * n[1]
-        twist[1] = arm[2] * n[0] - arm[0] * n[2]
-        twist[2] = arm[0] * n[1] - arm[1] * n[0]
-        twist[3:] = n
-        weight = 1.0 / (1.0 + (3 * residual / gate) ** 2) ** 2
-        for i in range(len(row)):
-            row[i] = 0.0
-            for j in range(6):
-                row[i] += basis[j, i] * twist[j]
-        for i in range(len(row)):
-            b[i] += weight * row[i] * residual
-            for j in range(len(row)):
-                A[i, j] += weight * row[i] * row[j]
+        residual = nx * gx + ny * gy + nz * gz
+        ax, ay, az = rx - mx, ry - my, rz - mz
+        twist[0], twist[1], twist[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        twist[3], twist[4], twist[5] = nx, ny, nz
+        share = 1.0 + (3 * residual / gate) ** 2
+        _add(A, b, row, basis, twist, residual, 1.0 / (share * share))
         used += 1
     return used
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest(place, nearest, origin, voxel):  # pyright: ignore
+def _add(A, b, row, basis, twist, residual, weight):  # pyright: ignore  # noqa: PLR0917
+    """One pair into the lower half of the normal equations."""
+    for i in range(len(row)):
+        row[i] = 0.0
+        for j in range(6):
+            row[i] += basis[j, i] * twist[j]
+        b[i] += weight * row[i] * residual
+        for j in range(i + 1):
+            A[i, j] += weight * row[i] * row[j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(A, b, x):  # pyright: ignore
+    """x of A x = b by Cholesky, with a little damping; A holds its lower half and is used up."""
+    n = len(b)
+    for i in range(n):
+        A[i, i] += 1e-3 * A[i, i] + 1e-6
+        for j in range(i + 1):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(A[i, i]) if i == j else A[i, j] / A[j, j]
+        x[i] = b[i]
+        for k in range(i):
+            x[i] -= A[i, k] * x[k]
+        x[i] /= A[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= A[k, i] * x[k]
+        x[i] /= A[i, i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(x, y, z, nearest, origin, voxel):  # pyright: ignore  # noqa: PLR0917
     """Index of the point nearest to a place, -1 where there is none."""
-    x = int(np.floor((place[0] - origin[0]) / voxel + 0.5))
-    y = int(np.floor((place[1] - origin[1]) / voxel + 0.5))
-    z = int(np.floor((place[2] - origin[2]) / voxel + 0.5))
-    if not (0 <= x < nearest.shape[0] and 0 <= y < nearest.shape[1] and 0 <= z < nearest.shape[2]):
+    i = int(np.floor((x - origin[0]) / voxel + 0.5))
+    j = int(np.floor((y - origin[1]) / voxel + 0.5))
+    k = int(np.floor((z - origin[2]) / voxel + 0.5))
+    if not (0 <= i < nearest.shape[0] and 0 <= j < nearest.shape[1] and 0 <= k < nearest.shape[2]):
         return -1
-    return nearest[x, y, z]
+    return nearest[i, j, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned(T, x, y, z):  # pyright: ignore
+    """A direction after the rotation of T."""
+    return (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z, T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+            T[2, 0] * x + T[2, 1] * y + T[2, 2] * z)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned_back(T, x, y, z):  # pyright: ignore
+    """A direction after the inverse of the rotation of T."""
+    return (T[0, 0] * x + T[1, 0] * y + T[2, 0] * z, T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
+            T[0, 2] * x + T[1, 2] * y + T[2, 2] * z)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _placed(T, x, y, z):  # pyright: ignore
+    """A point carried by T."""
+    u, v, w = _turned(T, x, y, z)
+    return u + T[0, 3], v + T[1, 3], w + T[2, 3]
 
 
 @numba.njit(cache=True, nogil=True)
 def _move(pose, centre, twist):  # pyright: ignore
     """Turns a pose by twist[:3] about the object's centre and shifts it by twist[3:], in place."""
+    mx, my, mz = _placed(pose, centre[0], centre[1], centre[2])
     angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2) + 1e-12
-    x, y, z = twist[0] / angle, twist[1] / angle, twist[2] / angle
+    ax, ay, az = twist[0] / angle, twist[1] / angle, twist[2] / angle
     s, c = np.sin(angle), np.cos(angle)
-    d = 1.0 - c
-    turn = np.array([
-        [c + x * x * d, x * y * d - z * s, x * z * d + y * s],
-        [x * y * d + z * s, c + y * y * d, y * z * d - x * s],
-        [x * z * d - y * s, y * z * d + x * s, c + z * z * d],
-    ])  # fmt: skip
-    R = np.ascontiguousarray(pose[:3, :3])
-    middle = R @ centre + pose[:3, 3]
-    pose[:3, :3] = turn @ R
-    pose[:3, 3] = middle + twist[3:] - turn @ R @ centre
+    for j in range(3):
+        # Rodrigues, column by column.
+        x, y, z = pose[0, j], pose[1, j], pose[2, j]
+        along = (1.0 - c) * (ax * x + ay * y + az * z)
+        pose[0, j] = c * x + s * (ay * z - az * y) + along * ax
+        pose[1, j] = c * y + s * (az * x - ax * z) + along * ay
+        pose[2, j] = c * z + s * (ax * y - ay * x) + along * az
+    ox, oy, oz = _turned(pose, centre[0], centre[1], centre[2])
+    pose[0, 3], pose[1, 3], pose[2, 3] = mx + twist[3] - ox, my + twist[4] - oy, mz + twist[5] - oz
