@@ -8,7 +8,7 @@ a logistic model, that ``python -m benchmarks.calibration`` fits on rendered sce
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -33,7 +33,11 @@ RIGHT_RADIANS = np.deg2rad(15.0)
 """A pose within these of the truth, modulo the object's symmetries, is right."""
 FEATURES = ("margin", "fit", "shown", "gain", "looked through", "spread", "hypothesis", "confidence")
 """What a probability is made of; :func:`Evidence.features`."""
+ORDINARY_NOISE = 0.00125
+"""Metres; where the plane shows too little to tell."""
 CONSTANTS = Path(__file__).with_name("calibration.yaml")
+_PLANE = 0.02
+"""Metres from the plane within which a reading that is no foreground is the plane's."""
 _DETAIL = 60.0
 """Apparent diameter at which poses are compared, pixels."""
 _FORM = CostForm().truncated(0.015)
@@ -146,6 +150,8 @@ class Evidence:
     hypothesis: float
     """Probability of the scene's hypothesis."""
     confidence: float
+    noise: float = ORDINARY_NOISE
+    """How far readings of the plane lie from it, metres."""
 
     def features(self) -> Floats:
         """The numbers that :data:`FEATURES` names."""
@@ -153,7 +159,7 @@ class Evidence:
         odds = np.clip(self.hypothesis, 1e-4, 1 - 1e-4)
         return np.array([
             np.clip(self.margin, -_CAP, _CAP),
-            np.log(max(self.fit, 5e-4)),
+            np.log(max(self.fit, 5e-4) / self.noise),
             np.log(max(self.shown, 10.0)),
             np.clip(self.gain, -1.0, 1.0),
             self.looked_through,
@@ -250,6 +256,15 @@ def _annotated(item: ObjectPose, found: PoseDoubt) -> ObjectPose:
     )
 
 
+def noise_of(scene: ObservedScene) -> float:
+    """Median distance of the plane's readings from it along their rays, metres: sensors differ by as much."""
+    part = np.s_[::3, ::3]
+    inverse, depth, factor = scene.plane_inverse[part], scene.depth[part], scene.factor[part]
+    behind = factor * np.abs(1.0 / np.where(inverse > 0, inverse, 1.0) - depth)
+    of_plane = behind[(inverse > 0) & (factor > 0) & ~scene.foreground[part] & (behind < _PLANE)]
+    return max(5e-4, float(np.median(of_plane))) if len(of_plane) >= 200 else ORDINARY_NOISE
+
+
 class Judge:
     """Judges scenes of one catalogue's objects."""
 
@@ -277,12 +292,14 @@ class Judge:
         self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
     ) -> list[tuple[Evidence, Others]]:
         """What the image says of each object's pose; ``hypothesis`` is the probability of the scene's."""
+        noise = noise_of(scene)
         found: list[tuple[Evidence, Others]] = []
         for i, item in enumerate(objects):
             others = np.maximum.reduce([scene.plane_inverse, *layers[:i], *layers[i + 1 :]])
             T = np.array(item.T_camera_object[:3], float)
             look = _Look(scene, self._model(item.label), T, layers[i], others)
-            found.append(look.evidence(item, self._calibration, hypothesis))
+            evidence, rest = look.evidence(item, self._calibration, hypothesis)
+            found.append((replace(evidence, noise=noise), rest))
         return found
 
     def layers(self, scene: ObservedScene, objects: Sequence[Judged]) -> list[Float32s]:
