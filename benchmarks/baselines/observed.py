@@ -119,6 +119,12 @@ class Crop:
         far = np.where(behind > 0, -_VIOLATION, -self.hiding[shown])
         return float(np.where(np.abs(behind) < _TOLERANCE, near, far).sum())
 
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Which points (N x 3 metres, camera frame) are seen in this part of the image."""
+        seen = self.view.project(points)
+        size = np.array([self.view.width, self.view.height])
+        return (points[:, 2] > 0) & ((seen > -0.5) & (seen < size - 0.5)).all(1)
+
     def ranked(self, soup: Soup, poses: Floats) -> Floats:
         """P x 4 x 4 poses of one object, the one that agrees best first."""
         scores = np.array([self.agreement(inverse_depth(soup, T, self.view)) for T in poses])

@@ -95,6 +95,8 @@ class Scene:
         grid = self._grid(box)
         leaders = grid[np.argsort(self._costs(box, grid, _COARSE), kind="stable")[:_LEADERS]]
         refined = best(box, leaders)
+        if not len(refined):
+            return refined
         chosen = refined[int(np.argmin(self._costs(box, refined, _NEAR)))]
         self._place(box.model, chosen)
         return chosen[None]
