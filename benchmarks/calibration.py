@@ -49,7 +49,7 @@ _CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
 _PLOT = _ROOT / "docs" / "figures" / "reliability.png"
 _SEEDS = {"train": 1001, "test": 3003}
 """Of the scenes; Clutter-15 has seed 0."""
-_POSE_SCALES = (20.0, 60.0, 180.0)
+_POSE_SCALES = (7.0, 20.0, 60.0)
 _SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1), strict=True))
 """Which way evidence points: a fit to few scenes must not turn it round."""
 _RIDGE = 1.0

@@ -35,7 +35,7 @@ def synthetic(count: int, seed: int) -> list[Scene]:
         evidence = replace(PLAIN, margin=margin, spread_metres=spread)
         right = bool(rng.random() < 1 / (1 + np.exp(-(margin - 100 * spread))))
         instance = Instance(
-            "mug", right, float(abs(rng.normal(0, 2 * spread))), 0.1, dict.fromkeys(("20.0", "60.0", "180.0"), evidence)
+            "mug", right, float(abs(rng.normal(0, 2 * spread))), 0.1, dict.fromkeys(("7.0", "20.0", "60.0"), evidence)
         )
         # The second hypothesis is true as often as a scale of 0.2 says it is.
         deficit = float(rng.uniform(0, 1))
