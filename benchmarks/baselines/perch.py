@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.baselines.common import Box, Dof, Found, best_set
 from benchmarks.baselines.icp import best, on_plane, rotations
@@ -72,7 +73,7 @@ class Scene:
     view: View
     points: Floats
     """H x W x 3 readings, z = 0 where there is none."""
-    foreground: Floats
+    foreground: NDArray[np.bool_]
     placed: Float32s
     """Inverse depth of the objects before."""
     tops: list[Floats]
@@ -86,7 +87,7 @@ class Scene:
         view = observed.view.sampled(*observed.whole, stride)
         part = np.s_[::stride, ::stride]
         empty = np.zeros((view.height, view.width), np.float32)
-        return Scene(observed, stride, view, observed.points[part], observed.foreground[part].astype(float), empty, [])
+        return Scene(observed, stride, view, observed.points[part], observed.foreground[part], empty, [])
 
     def search(self, box: Box) -> Floats:
         """The pose of least cost, which joins the scene; 1 x 4 x 4, none where the box holds no readings."""
@@ -102,16 +103,17 @@ class Scene:
         return chosen[None]
 
     def _costs(self, box: Box, poses: Floats, near: float) -> Floats:
-        """Two-sided cost of P x 4 x 4 poses."""
+        """Two-sided cost of P x 4 x 4 poses; the readings above the plane in the detector's box are sought."""
         x0, y0, x1, y1 = (edge // self.stride for edge in self.observed.region(box.candidate.box, _MARGIN))
         part = np.s_[y0 : y1 + 1, x0 : x1 + 1]
+        left, top, right, bottom = (edge // self.stride for edge in self.observed.region(box.candidate.box))
+        sought = np.zeros(self.foreground.shape, bool)
+        sought[top : bottom + 1, left : right + 1] = self.foreground[top : bottom + 1, left : right + 1]
         view = self.view.sampled(x0, y0, min(x1 + 1, self.view.width), min(y1 + 1, self.view.height), 1)
-        seen = np.ascontiguousarray(self.points[part]), np.ascontiguousarray(self.foreground[part])
-        placed, rays = np.ascontiguousarray(self.placed[part]), view.rays()
-        extent = np.stack([box.model.points.min(0), box.model.points.max(0)])
-        return np.array(
-            [two_sided(inverse_depth(box.model.soup, T, view), placed, *seen, rays, T, extent, near) for T in poses]
-        )
+        placed, points, sought = (np.ascontiguousarray(image[part]) for image in (self.placed, self.points, sought))
+        rays = view.rays()
+        layers = (inverse_depth(box.model.soup, T, view) for T in poses)
+        return np.array([two_sided(layer, placed, points, sought, rays, near) for layer in layers])
 
     def _grid(self, box: Box) -> Floats:
         """Poses whose centre is in the box, on the table and on what is placed there already, P x 4 x 4."""
@@ -151,8 +153,8 @@ def _distance(box: Box) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def two_sided(rendered, placed, points, foreground, rays, T, extent, near):  # pyright: ignore  # noqa: PLR0917
-    """Rendered points without a reading within ``near``, plus readings in the enclosing box without a rendered point.
+def two_sided(rendered, placed, points, sought, rays, near):  # pyright: ignore  # noqa: PLR0917
+    """Rendered points without a reading within ``near``, plus ``sought`` readings without a rendered point.
 
     A pixel whose reading lies 5 cm in front, or where an object before is nearer, counts for nothing.
     """
@@ -162,19 +164,9 @@ def two_sided(rendered, placed, points, foreground, rays, T, extent, near):  # p
             q, z = rendered[v, u], points[v, u, 2]
             if q > 0 and q > placed[v, u] and z > 0 and z >= 1.0 / q - _OCCLUDER:
                 cost += 0.0 if _has_reading(rays, 1.0 / q, points, v, u, near) else 1.0
-            if foreground[v, u] > 0 and placed[v, u] == 0 and _encloses(T, extent, points, v, u):
+            if sought[v, u] and placed[v, u] == 0:
                 cost += 0.0 if _has_rendered(points, rendered, rays, v, u, near) else 1.0
     return cost
-
-
-@numba.njit(cache=True, nogil=True)
-def _encloses(T, extent, points, v, u):  # pyright: ignore
-    """Whether a reading lies in the enclosing box of the object at T."""
-    x, y, z = points[v, u, 0] - T[0, 3], points[v, u, 1] - T[1, 3], points[v, u, 2] - T[2, 3]
-    inside = True
-    for i in range(3):
-        inside &= extent[0, i] < T[0, i] * x + T[1, i] * y + T[2, i] * z < extent[1, i]
-    return inside
 
 
 @numba.njit(cache=True, nogil=True)
