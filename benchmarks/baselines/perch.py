@@ -4,8 +4,9 @@ Narayanan and Likhachev (2016) explain the image by poses of three degrees of fr
 nearest first, is searched exhaustively, conditioned on those before it: a grid of 4 cm and 22.5 degrees over its box
 for each of its six faces (upright with 3 degrees of freedom), z from what carries it (the table or the top of an
 object before). The grid is ranked with a tolerance of half a cell, the best 100 poses are refined by ICP, as PERCH
-refines its states, and the one of least cost at 5 mm wins. For wrong boxes every set would have to be searched again:
-the boxes are searched once, and the set of best rendered-depth agreement is kept.
+refines its states, and the one of least cost at 5 mm wins. All readings of the detector's box are to be explained,
+where PERCH takes those in the volume of the object: what hides the object would cost nothing. For wrong boxes every
+set would have to be searched again: the boxes are searched once, and the set of best rendered-depth agreement is kept.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.common import Box, Dof, Found, best_set
-from benchmarks.baselines.icp import best, on_plane, rotations
+from benchmarks.baselines.icp import best, on_plane, rotations, starts
 from benchmarks.baselines.observed import Observed
 from benchmarks.baselines.registration import Model
 from benchmarks.datasets import Image
@@ -94,6 +95,9 @@ class Scene:
         if len(box.observed.inside(box.candidate)) < 10:
             return np.zeros((0, 4, 4))
         grid = self._grid(box)
+        if not len(grid):
+            # What carries the object is farther away and not placed yet: heights are then those that are measured.
+            grid = starts(box)
         leaders = grid[np.argsort(self._costs(box, grid, _COARSE), kind="stable")[:_LEADERS]]
         refined = best(box, leaders)
         if not len(refined):
