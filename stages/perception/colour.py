@@ -32,6 +32,8 @@ _SURE = 2.0
 """Standard errors by which a pose's colours must fit better than the favourite's."""
 _LEAST = 0.3
 """Mean distance, CIELAB units, below which no difference counts."""
+_SHARE = 0.1
+"""Share of the better distance by which it must be smaller: what no paint explains also errs in favour of one."""
 _XYZ_FROM_RGB = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
@@ -120,7 +122,7 @@ def judge(
     fits = distances(image, painted, normals)
     means = fits.mean(-1)
     best = int(np.argmin(means))
-    sure = _is_sure(fits[0] - fits[best], _tiles(rows, columns, stride))
+    sure = _is_sure(fits[0] - fits[best], _tiles(rows, columns, stride)) and means[0] > (1 + _SHARE) * means[best]
     return Verdict(best if sure else 0, means)
 
 
