@@ -58,7 +58,7 @@ def test_settings_reach_every_stage_that_has_them() -> None:
 @needs_data
 @pytest.mark.slow
 def test_processes_that_share_hypotheses_give_the_scene_that_one_process_gives() -> None:
-    few = ("particle_filter.particles=50", "particle_filter.iterations=12", "hypotheses.max_hypotheses=3")
+    few = ("particle_filter.particles=50", "particle_filter.iterations=12", "hypotheses.finalists=3")
     alone, shared = (
         estimate(LAYOUT, "noisy", Settings(dof=3, set=few, processes=count, share="hypotheses"), [(2, 0)])[0]
         for count in (1, 2)
