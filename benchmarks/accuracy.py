@@ -165,7 +165,8 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     z, n = 1.96, max(1, count)
     share = hits / n
     middle, reach = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return float((middle - reach) / (1 + z * z / n)), float((middle + reach) / (1 + z * z / n))
+    low, high = (middle - reach) / (1 + z * z / n), (middle + reach) / (1 + z * z / n)
+    return max(0.0, float(low)), min(1.0, float(high))
 
 
 def table(scores: Sequence[Score], sets: tuple[int, int]) -> str:
