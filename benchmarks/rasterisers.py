@@ -107,7 +107,7 @@ def ray_casting(task: Task) -> Costs:
     Raises:
         ModuleNotFoundError: Open3D is not installed.
     """
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports]
 
     scene: Any = open3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(task.mesh.vertices.astype(np.float32), task.mesh.faces.astype(np.uint32))

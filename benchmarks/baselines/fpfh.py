@@ -107,7 +107,7 @@ def _rigid(model: Floats, readings: Floats) -> Floats:
 
 def _open3d() -> Any:
     try:
-        import open3d
+        import open3d  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise Refused("fpfh needs Open3D: pip install '.[benchmarks]' -c constraints.txt") from error
     return open3d
