@@ -43,7 +43,6 @@ BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 FLUSH_SECONDS = 1.0
 RECORDER = "recorder"
-PROCESS_PATH = "{0.stage}/{0.replica}/{0.incarnation}"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -53,6 +52,17 @@ class Process:
     stage: str
     replica: int
     incarnation: int = 0
+
+    @staticmethod
+    def of(key: str) -> Process:
+        """The process that a key ends with."""
+        stage, replica, incarnation = key.split("/")[-3:]
+        return Process(stage, int(replica), int(incarnation))
+
+    @property
+    def path(self) -> str:
+        """The end of its keys."""
+        return f"{self.stage}/{self.replica}/{self.incarnation}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +115,13 @@ class Bus:
 
     def announce(self, process: Process) -> None:
         """Declares this process present, until it closes or dies."""
-        key = f"{self._run}/present/{process.stage}/{process.replica}/{process.incarnation}"
-        self._declared.append(self._session.liveliness().declare_token(key))
+        self._declared.append(self._session.liveliness().declare_token(f"{self._run}/present/{process.path}"))
 
     def watch(self, callback: Callable[[Process, bool], None]) -> None:
         """Calls back for every process that is or becomes present (True) and that goes (False)."""
 
         def receive(sample: zenoh.Sample, _: int) -> None:
-            stage, replica, incarnation = str(sample.key_expr).split("/")[-3:]
-            present = sample.kind == zenoh.SampleKind.PUT
-            callback(Process(stage, int(replica), int(incarnation)), present)
+            callback(Process.of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
         subscriber = self._session.liveliness().declare_subscriber(
             f"{self._run}/present/*/*/*", self._in_turn(receive), history=True

@@ -17,7 +17,7 @@ from typing import IO, Any
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from runner.bus import PROCESS_PATH, RECORDER, Bus, Packet, Process
+from runner.bus import RECORDER, Bus, Packet, Process
 from runner.children import die_with_parent
 from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
@@ -246,7 +246,7 @@ class Recorder:
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if not present:
-            self._echoes.put((f"gone/{PROCESS_PATH.format(process)}", b""))
+            self._echoes.put((f"gone/{process.path}", b""))
 
     def _echo_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""

@@ -161,8 +161,7 @@ class Supervisor:
             self._events.put(End(finished.code, finished.reason))
 
     def _on_gone(self, packet: Packet) -> None:
-        _, stage, replica, incarnation = packet.key.split("/")
-        self._settled.add(Process(stage, int(replica), int(incarnation)))
+        self._settled.add(Process.of(packet.key))
 
     def _on_presence(self, process: Process, present: bool) -> None:
         self._delivery.update(process, present)

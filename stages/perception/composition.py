@@ -99,6 +99,20 @@ def charge(boxes: Sequence[Floats], share: float) -> float:
     return share * CostForm().truncation * sum(areas)
 
 
+def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:
+    """Mean distance over the pixels that show an object (metres, bounded) and the share of it that nothing hides.
+
+    ``layer`` and ``others`` are H x W inverse depths of the object and of all else.
+    """
+    silhouette = layer > 0
+    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
+    shown = silhouette & ~((layer < others) | (behind > form.occluder_margin))
+    read = shown & (scene.factor > 0)
+    distances = np.minimum(np.abs(behind[read]), form.truncation)
+    cost = float(distances.mean(dtype=np.float64)) if read.any() else form.truncation
+    return cost, float(shown.sum() / max(1, silhouette.sum()))
+
+
 def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse

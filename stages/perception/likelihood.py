@@ -34,7 +34,7 @@ class CostForm:
       The pixel stays as unexplained as it was and costs ``occluder_cost`` besides.
     * Otherwise the distance between the two points, at most ``truncation``.
 
-    ``one_sided`` is the paper's plain sum: a pixel is worth explaining by all that the background misses it by.
+    ``plain`` is the paper's plain sum: a pixel is worth explaining by all that the background misses it by.
     """
 
     truncation: float = 0.03

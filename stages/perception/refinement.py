@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.perception.colour import Contender, Paint, Verdict, judge
+from stages.perception.composition import fit, scene_cost
 from stages.perception.contact import Solid, apparent, contacts, penalty
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.particle_filter import FilterSettings, Rectangle
 from stages.perception.poses import symmetry_angle
 from stages.perception.proposals import Dof, Proposals
 from stages.perception.rasteriser import Float32s, inverse_depth
-from stages.perception.scene_filter import scene_cost
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 _GAIN = 5e-6
@@ -347,20 +347,6 @@ def _shown(window: Window, layer: Float32s, form: CostForm) -> NDArray[np.bool_]
     """Where an object at a pose can be seen: nothing known and no reading lies in front of it."""
     behind = window.factor * (1.0 / np.where(layer > 0, layer, 1.0) - window.observed)
     return (layer > window.inverse_background) & ~(behind > form.occluder_margin)
-
-
-def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:
-    """Mean distance over the pixels that show an object (metres, bounded) and the share of it that nothing hides.
-
-    ``layer`` and ``others`` are H x W inverse depths of the object and of all else.
-    """
-    silhouette = layer > 0
-    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
-    shown = silhouette & ~((layer < others) | (behind > form.occluder_margin))
-    read = shown & (scene.factor > 0)
-    distances = np.minimum(np.abs(behind[read]), form.truncation)
-    cost = float(distances.mean(dtype=np.float64)) if read.any() else form.truncation
-    return cost, float(shown.sum() / max(1, silhouette.sum()))
 
 
 def _around(shape: Shape, pose: Floats, scene: ObservedScene) -> Rectangle:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.messages.digest import Glimpse
-from stages.perception.composition import Composition, glimpse, scene_cost
-from stages.perception.likelihood import CostForm, ObservedScene, with_object
+from stages.perception.composition import Composition, fit, glimpse, scene_cost
+from stages.perception.likelihood import ObservedScene, with_object
 from stages.perception.particle_filter import FilterSettings, ObjectFilter, Track, pixels
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, Floats
@@ -233,7 +233,8 @@ class SceneFilter:
 
     def _found(self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s]) -> Iterator[Found]:
         for i, track in enumerate(tracks):
-            yield _fit(scene, track, layers[i], _composite(scene, [*layers[:i], *layers[i + 1 :]]), self._settings.cost)
+            others = _composite(scene, [*layers[:i], *layers[i + 1 :]])
+            yield Found(track, *fit(scene, layers[i], others, self._settings.cost))
 
     def _keys(self, draft: _Draft, purpose: bytes) -> list[bytes]:
         """One seed an object, from the observation and all of the hypothesis."""
@@ -311,17 +312,6 @@ class _Draft:
 def _window(scene: ObservedScene, suspect: Suspect) -> tuple[slice, slice]:
     x0, y0, x1, y1 = pixels(suspect.box, scene)
     return np.s_[y0:y1, x0:x1]
-
-
-def _fit(scene: ObservedScene, track: Track, layer: Float32s, others: Float32s, form: CostForm) -> Found:
-    silhouette = layer > 0
-    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
-    hidden = (layer < others) | (behind > form.occluder_margin)
-    shown = silhouette & ~hidden
-    read = shown & (scene.factor > 0)
-    distances = np.minimum(np.abs(behind[read]), form.truncation)
-    cost = float(distances.mean(dtype=np.float64)) if read.any() else form.truncation
-    return Found(track, cost, float(shown.sum() / max(1, silhouette.sum())))
 
 
 def _composite(scene: ObservedScene, layers: Sequence[Float32s]) -> Float32s:
