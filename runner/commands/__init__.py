@@ -1,0 +1,38 @@
+"""The subcommands of ``runner``, one module a group: how each is spelled, and which function does it.
+
+Modules of the runner are imported when a command runs: ``runner --help`` and completion answer at once.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Commands = Any
+"""What argparse returns from ``add_subparsers``; it has no public type."""
+Command = Callable[[argparse.Namespace], int]
+"""Runs with the parsed options and returns the exit status."""
+
+
+def add(commands: Commands, name: str, command: Command, text: str) -> argparse.ArgumentParser:
+    """Adds a subcommand; ``text`` says in one line what it does."""
+    parser = commands.add_parser(name, help=text, description=text.capitalize() + ".")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def add_graph(parser: argparse.ArgumentParser) -> None:
+    """Adds a graph file and the settings that change it."""
+    parser.add_argument("graph", type=Path, metavar="GRAPH", help="a graph file")
+    add_settings(parser)
+
+
+def add_file(parser: argparse.ArgumentParser) -> None:
+    """Adds a recording."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Adds ``--set``, as ``settings``."""
+    text = "change a setting, for example camera.dataset=DIR; may be given again"
+    parser.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", dest="settings", help=text)

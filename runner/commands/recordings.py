@@ -1,0 +1,54 @@
+"""Commands on recordings: ``info``, ``replay``, ``view``."""
+
+import argparse
+from pathlib import Path
+
+from runner.commands import Commands, add, add_file, add_settings
+from runner.contract import Refused
+
+
+def add_commands(commands: Commands) -> None:
+    """Adds the commands of this group."""
+    add_file(add(commands, "info", _info, "say what a recording holds and whether it is complete"))
+    _add_replay(commands)
+    _add_view(commands)
+
+
+def _add_replay(commands: Commands) -> None:
+    replay = add(commands, "replay", _replay, "execute the stages of a recording again from what they consumed")
+    add_file(replay)
+    replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
+    add_settings(replay)
+
+
+def _add_view(commands: Commands) -> None:
+    view = add(commands, "view", _view, "show a recording, or a graph while it runs")
+    view.add_argument("file", type=Path, metavar="FILE", nargs="?", help="a recording")
+    view.add_argument("--live", action="store_true", help="follow the run that is being recorded")
+    view.add_argument("--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening the viewer")
+    view.add_argument("--png", type=Path, metavar="PNG", help="write a picture instead of opening the viewer")
+
+
+def _info(options: argparse.Namespace) -> int:
+    from runner.info import describe
+
+    print(describe(options.file))
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from runner.replay import replay
+
+    return replay(options.file, verify=options.verify, assignments=options.settings)
+
+
+def _view(options: argparse.Namespace) -> int:
+    from runner.view import view_live, view_recording
+
+    if options.live:
+        view_live(options.file)
+    elif options.file is None:
+        raise Refused("runner view: name a recording, or --live")
+    else:
+        view_recording(options.file, save=options.save, png=options.png)
+    return 0
