@@ -115,7 +115,8 @@ def _stream(path: Path) -> rr.RecordingStream:
 def view_live(path: Path | None = None, *, folder: Path = Path("recordings")) -> None:
     """Shows a graph while it runs: ``path`` is its recording, by default the one in ``folder`` being written."""
     path = path or newest_live(folder)
-    os.nice(10)  # the graph comes first: drawing takes what it leaves
+    # The graph comes first: drawing, and the viewer that this starts, take what it leaves of the cores.
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     port = _free_port()
     viewer = _start_viewer(port, "--expect-data-soon")
     try:
