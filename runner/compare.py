@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -23,6 +24,13 @@ class Difference:
     replayed: str
     extent: str = ""
     """For arrays: how many elements differ, and by how much at most."""
+    largest: float | None = None
+    """Largest absolute difference of numbers; infinite between a number and NaN, None where they are no numbers."""
+
+    @property
+    def pattern(self) -> str:
+        """The field without indices, for example ``objects[].T_camera_object[]``."""
+        return re.sub(r"\[[^\]]*\]", "[]", self.field)
 
     def __str__(self) -> str:
         extent = f" ({self.extent})" if self.extent else ""
@@ -43,7 +51,7 @@ def differences(recorded: Any, replayed: Any, field: str = "") -> Iterator[Diffe
     elif isinstance(recorded, list | tuple):
         yield from _sequence_differences(cast("Sequence[Any]", recorded), cast("Sequence[Any]", replayed), field)
     elif repr(recorded) != repr(replayed):
-        yield Difference(field, _show(recorded), _show(replayed))
+        yield Difference(field, _show(recorded), _show(replayed), largest=_gap(recorded, replayed))
 
 
 def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str) -> Iterator[Difference]:
@@ -68,19 +76,27 @@ def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str
     if not unequal.any():
         return
     first = tuple(int(extent) for extent in np.argwhere(unequal)[0])
-    extent = f"{np.count_nonzero(unequal)} of {unequal.size} elements differ, by {_largest(recorded, replayed)} at most"
+    largest = _largest(recorded[unequal], replayed[unequal])
+    extent = f"{np.count_nonzero(unequal)} of {unequal.size} elements differ, by {largest:.3g} at most"
     place = f"{field}[{', '.join(map(str, first))}]"
-    yield Difference(place, _show(recorded[first].item()), _show(replayed[first].item()), extent)
+    yield Difference(place, _show(recorded[first].item()), _show(replayed[first].item()), extent, largest)
 
 
 def _bits(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array).view(f"u{array.dtype.itemsize}").reshape(array.shape)
 
 
-def _largest(recorded: NDArray[Any], replayed: NDArray[Any]) -> str:
+def _gap(recorded: Any, replayed: Any) -> float | None:
+    numbers = isinstance(recorded, int | float) and not isinstance(recorded, bool)
+    return _largest(np.array([recorded]), np.array([replayed])) if numbers else None
+
+
+def _largest(recorded: NDArray[Any], replayed: NDArray[Any]) -> float:
+    """Largest absolute difference; infinite where a number became NaN or infinite or the other way round."""
     with np.errstate(all="ignore"):
         gaps = np.abs(recorded.astype(np.float64) - replayed.astype(np.float64))
-    return f"{np.nanmax(gaps, initial=0.0):.3g}"
+    gaps[(recorded == replayed) | (np.isnan(recorded) & np.isnan(replayed))] = 0.0
+    return float(np.max(np.where(np.isnan(gaps), np.inf, gaps), initial=0.0))
 
 
 def _kind(array: NDArray[Any]) -> str:

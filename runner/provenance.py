@@ -10,6 +10,8 @@ from typing import Any, cast
 
 import numpy as np
 
+NUMERICAL = ("llvmlite", "mujoco", "numba", "numpy", "opencv-contrib-python-headless", "pyrender", "scipy", "torch")
+"""Packages that compute: another version may round a float differently."""
 HASHED_BYTES = 64 * 2**20
 """Larger files are named without a hash."""
 
@@ -40,9 +42,18 @@ def machine() -> dict[str, str]:
         "processor": _processor("model name") or platform.processor(),
         "vectors": " ".join(flag for flag in _processor("flags").split() if flag.startswith(("avx", "fma", "sse4"))),
         "system": platform.platform(),
+        "libc": " ".join(platform.libc_ver()),
         "python": platform.python_version(),
         "blas": f"{blas.get('name')} {blas.get('version')}",
     }
+
+
+def fingerprint(machine: Mapping[str, str], packages: Mapping[str, str]) -> str:
+    """One hash over all that equal bytes need: the processor and its vector units, libm, the interpreter, BLAS and the
+    packages that compute. Where it differs from the recording's, floats are equal within tolerances only."""
+    parts = [machine.get(key, "") for key in ("processor", "vectors", "libc", "python", "blas")]
+    parts += [f"{name} {packages.get(name, 'absent')}" for name in NUMERICAL]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def _processor(key: str) -> str:

@@ -22,7 +22,7 @@ from runner.children import die_with_parent
 from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
 from runner.contract import Message, Refused
-from runner.provenance import file_hashes, machine, package_versions, portable, revision
+from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording import JOURNAL, LOG, PROFILE, RUN, VERDICT, Ledger, Verdict, replicated, split_id, topic_of
 
 FLUSH_SECONDS = 0.25
@@ -68,6 +68,7 @@ def topic(kind: type[Message]) -> Topic:
 def run_metadata(manifest: Manifest) -> dict[str, str]:
     """What ran where, as the recording keeps it: one JSON text per aspect."""
     graph = portable(json.loads(manifest.graph), Path.cwd())
+    here, packages = machine(), package_versions()
     return {
         "graph": json.dumps(graph),
         "name": graph["name"],
@@ -75,8 +76,9 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
         "settings": json.dumps(manifest.settings),
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "revision": revision(),
-        "packages": json.dumps(package_versions()),
-        "machine": json.dumps(machine()),
+        "packages": json.dumps(packages),
+        "machine": json.dumps(here),
+        "fingerprint": fingerprint(here, packages),
         "files": json.dumps(file_hashes(graph)),
     }
 

@@ -15,6 +15,7 @@ from mcap.records import Metadata
 from runner.codec import CodecError, Envelope, LogLine, Step, unpack
 from runner.container import Container, Damage, Entry, open_file
 from runner.contract import Refused
+from runner.provenance import fingerprint
 
 T = TypeVar("T")
 PROFILE = "scene-programming"
@@ -142,6 +143,11 @@ class Recording:
     def run(self) -> dict[str, str]:
         """What ran where: graph, settings, seed, versions, revision, fingerprint."""
         return self.metadata[RUN]
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the processor and the libraries it was computed with, see :mod:`runner.provenance`."""
+        return fingerprint(self.aspect("machine", dict[str, str]()), self.aspect("packages", dict[str, str]()))
 
     @property
     def graph(self) -> dict[str, Any]:
