@@ -10,6 +10,7 @@
 ``RUN/l/STAGE``                            log lines (LogLine)
 ``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers
 ``RUN/flush``                              query answered by the recorder once it has everything sent before
+``RUN/q/NAME``                             question to the supervisor (status, down, restart, call), answered in JSON
 =========================================  ====================================================================
 
 Links keep their order, so that a step that the recorder has is there with everything it emitted. A process that is
@@ -21,6 +22,7 @@ was journalled or its part was handed to another replica: readers tell by the id
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -37,12 +39,18 @@ from typing import TypeVar
 import zenoh
 from zenoh.handlers import Callback
 
+from runner.contract import Refused
+
 A = TypeVar("A")
 
 BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 FLUSH_SECONDS = 1.0
+ASK_AGAIN_SECONDS = 0.05
+"""A peer that has just been met has not heard of every queryable."""
 RECORDER = "recorder"
+REFUSAL = zenoh.Encoding.TEXT_PLAIN
+"""Of an error that was given as an answer; Zenoh's own, such as a time-out, have another."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -143,6 +151,30 @@ class Bus:
         replies = self._session.get(f"{self._run}/flush", timeout=FLUSH_SECONDS)
         return any(reply.ok is not None for reply in replies)
 
+    def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
+        """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
+
+        What it raises becomes an error reply: the text of a Refused, of anything else its type too.
+        """
+        key = f"{self._run}/q/{name}"
+
+        def receive(query: zenoh.Query) -> None:
+            threading.Thread(target=_reply, args=(query, key, answer), name=name, daemon=True).start()
+
+        self._declared.append(self._session.declare_queryable(key, Callback(receive, indirect=False)))
+
+    def ask(self, name: str, question: bytes, timeout_s: float) -> bytes:
+        """The answer of whoever serves ``name``; raises Refused with its reason, or where nobody answers in time."""
+        deadline = time.monotonic() + timeout_s
+        while (left := deadline - time.monotonic()) > 0:
+            for reply in self._session.get(f"{self._run}/q/{name}", payload=question, timeout=left):
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+                if reply.err is not None and reply.err.encoding == REFUSAL:
+                    raise Refused(reply.err.payload.to_string())
+            time.sleep(ASK_AGAIN_SECONDS)
+        raise Refused(f"{self._run}: no answer to {name!r} within {timeout_s:g} s")
+
     def close(self) -> None:
         """Withdraws everything declared and closes the session."""
         for declared in reversed(self._declared):
@@ -202,6 +234,16 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:
+    with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
+        try:
+            query.reply(key, answer(query.payload.to_bytes() if query.payload else b""))
+        except Refused as refusal:
+            query.reply_err(str(refusal), encoding=REFUSAL)
+        except Exception as error:
+            query.reply_err(f"{type(error).__name__}: {error}", encoding=REFUSAL)
 
 
 def _config(listen: str, connect: str | None) -> zenoh.Config:

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import os
 import queue
 import signal
 import subprocess
@@ -24,6 +25,8 @@ from runner.host import EXIT_REFUSED, Assignment
 from runner.info import stage_times
 from runner.ports import port_name
 from runner.recorder import Manifest, topic
+from runner.registry import Entry, Registration, runs
+from runner.status import ProcessStatus, RunStatus
 from runner.step import sequence_of
 from runner.terminal import Terminal
 
@@ -52,6 +55,8 @@ class _Child:
     log: Path
     started: float = field(default_factory=time.monotonic)
     announced: bool = False
+    restarted_because: str = ""
+    """Why its predecessor ended."""
 
     def reason(self) -> str:
         """Why it ended: the signal, or the last thing it printed."""
@@ -81,8 +86,11 @@ class _Progress:
 class Supervisor:
     """One run of a graph."""
 
-    def __init__(self, graph: Graph, *, recordings: Path, settings: tuple[str, ...], terminal: Terminal):
-        """Makes the folder of the run; raises Refused where that is not possible."""
+    def __init__(self, graph: Graph, *, file: Path, recordings: Path, settings: tuple[str, ...], terminal: Terminal):
+        """Makes the folder of the run and lists it; raises Refused where that is not possible.
+
+        ``file`` is where the graph was read from.
+        """
         self._graph = graph
         self._settings = settings
         self._terminal = terminal
@@ -90,6 +98,15 @@ class Supervisor:
         self.directory = self.recording.with_suffix("")
         self._endpoint = free_endpoint()
         self._bus = Bus(self._run, listen=self._endpoint)
+        self._entry = Entry(
+            run=self._run,
+            endpoint=self._endpoint,
+            pid=os.getpid(),
+            graph=str(file.absolute()),
+            recording=str(self.recording.absolute()),
+            started=time.time(),
+        )
+        self._registration = Registration(self._entry)
         self._stopping = threading.Event()
         self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.publish, self._warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
@@ -130,6 +147,7 @@ class Supervisor:
         self._bus.subscribe("l/*", self._on_log)
         self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
         self._bus.subscribe("gone/*/*/*", self._on_gone)
+        self._bus.serve("status", lambda _: msgspec.json.encode(self._status()))
         self._bus.watch(self._on_presence)
 
     def _on_step(self, packet: Packet) -> None:
@@ -256,6 +274,7 @@ class Supervisor:
         self._settle(child)
         successor = Process(process.stage, process.replica, process.incarnation + 1)
         self._children[process.stage, process.replica] = self._start(successor)
+        self._children[process.stage, process.replica].restarted_because = child.reason()
         return None
 
     def _settle(self, child: _Child) -> None:
@@ -285,6 +304,7 @@ class Supervisor:
         last = [child for child in (self._recorder, self._viewer) if child is not None]
         _end_all(last, RECORDER_GRACE_SECONDS)
         self._bus.close()
+        self._registration.close()
         return "" if self._recorder is None else self._recorder.reason()
 
     def _conclude(self, end: End, verdict: str) -> End:
@@ -293,6 +313,34 @@ class Supervisor:
             self._terminal.plain("", *stage_times(self._steps), "")
         self._terminal.plain(f"recording {verdict}")
         return end if complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
+
+    # ------------------------------------------------------------------------------------------ what is asked
+
+    def _status(self) -> RunStatus:
+        children = [*filter(None, [self._recorder]), *list(self._children.values())]
+        return RunStatus(
+            run=self._run,
+            graph=self._entry.graph,
+            recording=self._entry.recording,
+            endpoint=self._endpoint,
+            started=self._entry.started,
+            ready=not self._absent,
+            processes=tuple(map(self._process_status, children)),
+        )
+
+    def _process_status(self, child: _Child) -> ProcessStatus:
+        process = child.process
+        ended = child.handle.poll() is not None
+        ready = child.announced or process.stage == RECORDER
+        return ProcessStatus(
+            stage=process.stage,
+            replica=process.replica,
+            replicated=self._name_of(process.stage, process.replica) != process.stage,
+            state="ended" if ended else "ready" if ready else "starting",
+            pid=child.handle.pid,
+            restarts=process.incarnation,
+            reason=child.restarted_because,
+        )
 
     # ------------------------------------------------------------------------------------------ what is said
 
@@ -317,8 +365,11 @@ class Supervisor:
 def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
     """A run id that is not taken and its recording; its folder is made."""
     base = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    taken = {entry.run for entry in runs()}
     for attempt in itertools.count():
         run = f"{base}-{attempt}" if attempt else base
+        if run in taken:
+            continue
         try:
             (folder / run / "log").mkdir(parents=True)
         except FileExistsError:

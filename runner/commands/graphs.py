@@ -28,7 +28,9 @@ def _up(options: argparse.Namespace) -> int:
     settings = (*options.settings, *seed)
     graph = load_graph(options.graph, settings)
     terminal = Terminal()
-    supervisor = Supervisor(graph, recordings=options.recordings, settings=settings, terminal=terminal)
+    supervisor = Supervisor(
+        graph, file=options.graph, recordings=options.recordings, settings=settings, terminal=terminal
+    )
     end = supervisor.run(view=options.view)
     terminal.plain(end.reason)
     return end.code
