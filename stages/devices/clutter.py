@@ -34,9 +34,6 @@ COUNTS = (5, 6, 4, 7, 5, 6, 3, 6, 5, 5)
 """Objects of ten scenes: 104 in 20 scenes, 3 to 7 in one."""
 LEAST_VISIBLE = 0.2
 """A pile of which an object shows a smaller share is dropped again."""
-_VIEWS = 5
-_SPREAD = 0.045
-"""Standard deviation of where objects are dropped, metres."""
 _FARTHEST = 0.3
 """Metres from the middle at which an object has rolled out of the pile."""
 _RESTING_SHARE = 0.45
@@ -46,6 +43,34 @@ _DEPTH_SCALE = 0.1
 """Millimetres per unit of the depth images."""
 _TABLE = 0.8
 _CELLS = 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pile:
+    """How objects are piled and seen; the defaults are Clutter-15's."""
+
+    counts: tuple[int, ...] = COUNTS
+    """Objects of one scene after the other, then from the first again."""
+    labels: tuple[str, ...] = ()
+    """The objects that scenes choose from; none means all of the catalogue."""
+    spread: float = 0.045
+    """Standard deviation of where objects are dropped, metres."""
+    least_visible: float = LEAST_VISIBLE
+    """Share of its silhouette that every object shows."""
+    views: int = 5
+    """Of which the one is taken that hides most."""
+    distance: tuple[float, float] = (0.8, 1.2)
+    """Metres between camera and pile."""
+    pitch: tuple[float, float] = (25.0, 60.0)
+    """Degrees between the line of sight and the table."""
+    sensor: StructuredLight = SENSOR
+    jitter: float = 0.05
+    """Share of its size by which a noisy box is off."""
+    false: tuple[int, int] = (2, 3)
+    """Least and greatest number of noisy boxes of objects that are not there."""
+
+
+CLUTTER_15 = Pile()
 
 
 @dataclass(frozen=True)
@@ -79,21 +104,22 @@ class Scene:
 class Clutter:
     """Piles of the objects of a catalogue; scene ``i`` of a seed is the same whatever else is generated."""
 
-    def __init__(self, catalogue: Catalogue, *, seed: int = 0, per_scene: Sequence[int] = COUNTS) -> None:
+    def __init__(self, catalogue: Catalogue, *, seed: int = 0, pile: Pile = CLUTTER_15) -> None:
         self._catalogue = catalogue
         self._things = dict(zip(catalogue.objects, things(catalogue), strict=True))
         self._seed = seed
-        self._counts = per_scene
+        self._pile = pile
         self._renderer = Renderer(*SIZE)
 
     def chosen(self, count: int) -> list[tuple[str, ...]]:
-        """The objects of the first ``count`` scenes: all of the catalogue equally often, none twice in a scene."""
+        """The objects of the first ``count`` scenes: all that there are equally often, none twice in a scene."""
         rng = np.random.default_rng([self._seed, 0])
-        used = dict.fromkeys(self._catalogue.objects, 0)
+        counts = self._pile.counts
+        used = dict.fromkeys(self._pile.labels or self._catalogue.objects, 0)
         scenes: list[tuple[str, ...]] = []
         for index in range(count):
             order = {label: (used[label], rng.random()) for label in used}
-            size = min(self._counts[index % len(self._counts)], len(used))
+            size = min(counts[index % len(counts)], len(used))
             scenes.append(tuple(sorted(used, key=order.__getitem__)[:size]))
             for label in scenes[-1]:
                 used[label] += 1
@@ -103,10 +129,10 @@ class Clutter:
         """Drops the objects until a view shows enough of each, and takes of its views the one that hides most."""
         rng = np.random.default_rng([self._seed, 1, index])
         while True:
-            poses = self._pile(labels, rng)
-            cameras = [_camera(poses, rng) for _ in range(_VIEWS)] if poses else []
+            poses = self._dropped(labels, rng)
+            cameras = [_camera(poses, self._pile, rng) for _ in range(self._pile.views)] if poses else []
             views = [(camera, self._see(labels, poses, camera)) for camera in cameras]
-            views = [view for view in views if _enough(view[1])]
+            views = [view for view in views if _enough(view[1], self._pile.least_visible)]
             if views:
                 camera, seen = min(views, key=lambda view: np.mean([each.visible for each in view[1]]))
                 rgb, depth = self._image(labels, poses, camera, rng)
@@ -116,14 +142,14 @@ class Clutter:
         """Frees the renderer."""
         self._renderer.close()
 
-    def _pile(self, labels: Sequence[str], rng: np.random.Generator) -> list[Floats]:
+    def _dropped(self, labels: Sequence[str], rng: np.random.Generator) -> list[Floats]:
         """T_world_object of each, dropped one after the other, the widest first; empty where one rolled away."""
         order = sorted(range(len(labels)), key=lambda i: -_width(self._things[labels[i]]))
         down: list[Thing] = []
         poses: list[Floats] = []
         for i in order:
             down.append(self._things[labels[i]])
-            poses = settle(down, [*poses, _start(down[-1], down, poses, rng)])
+            poses = settle(down, [*poses, _start(down[-1], down, poses, self._pile.spread, rng)])
         still = _resting(down, poses)
         if still is None or any(np.linalg.norm(T[:2, 3]) > _FARTHEST for T in still):
             return []
@@ -145,14 +171,16 @@ class Clutter:
         grey = int(rng.integers(40, 200))
         rgb = self._renderer.color(items, camera, lighting=_lighting(rng), background=(grey, grey, grey))
         depth = self._renderer.depth(items, camera)
-        return color_noise(rgb, rng, sigma=4.0), structured_light(depth, camera.K, rng, SENSOR)
+        return color_noise(rgb, rng, sigma=4.0), structured_light(depth, camera.K, rng, self._pile.sensor)
 
 
 def _width(thing: Thing) -> float:
     return float(np.ptp(thing.mesh.vertices[:, :2], axis=0).max())
 
 
-def _start(thing: Thing, down: Sequence[Thing], poses: Sequence[Floats], rng: np.random.Generator) -> Floats:
+def _start(
+    thing: Thing, down: Sequence[Thing], poses: Sequence[Floats], spread: float, rng: np.random.Generator
+) -> Floats:
     """A pose above whatever lies where the thing is dropped."""
     T = np.eye(4)
     if rng.random() < _RESTING_SHARE or not poses:
@@ -160,7 +188,7 @@ def _start(thing: Thing, down: Sequence[Thing], poses: Sequence[Floats], rng: np
         T[:3, :3] = turn @ thing.resting[int(rng.integers(len(thing.resting))) if poses else 0]
     else:
         T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    T[:2, 3] = rng.normal(0, _SPREAD, 2) if poses else 0.0
+    T[:2, 3] = rng.normal(0, spread, 2) if poses else 0.0
     points = thing.mesh.vertices @ T[:3, :3].T
     reach = float(np.linalg.norm(points[:, :2], axis=1).max())
     T[2, 3] = _top(T[:2, 3], reach, down, poses) + 0.01 - points[:, 2].min()
@@ -188,12 +216,12 @@ def _resting(down: Sequence[Thing], poses: list[Floats]) -> list[Floats] | None:
     return None
 
 
-def _camera(poses: Sequence[Floats], rng: np.random.Generator) -> Camera:
-    """Looks at the pile from 0.8 to 1.2 m away and 25 to 60 degrees above the table."""
+def _camera(poses: Sequence[Floats], pile: Pile, rng: np.random.Generator) -> Camera:
+    """Looks at the pile from above the table."""
     target = np.mean([T[:3, 3] for T in poses], axis=0) + rng.normal(0, 0.02, 3)
-    pitch, turn = np.deg2rad(rng.uniform(25, 60)), rng.uniform(0, 2 * np.pi)
+    pitch, turn = np.deg2rad(rng.uniform(*pile.pitch)), rng.uniform(0, 2 * np.pi)
     away = np.array([np.cos(pitch) * np.cos(turn), np.cos(pitch) * np.sin(turn), np.sin(pitch)])
-    T = looking_at(target + rng.uniform(0.8, 1.2) * away, target)
+    T = looking_at(target + rng.uniform(*pile.distance) * away, target)
     T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", rng.normal(0, 3), degrees=True).as_matrix()
     return Camera(K, T)
 
@@ -209,10 +237,10 @@ def _box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
 
 
-def _enough(seen: Sequence[Seen]) -> bool:
+def _enough(seen: Sequence[Seen], least_visible: float) -> bool:
     """Whether all objects lie in the image and show enough of themselves."""
     return all(
-        each.visible >= LEAST_VISIBLE
+        each.visible >= least_visible
         and min(each.box[:2]) > 0
         and each.box[0] + each.box[2] < SIZE[0]
         and each.box[1] + each.box[3] < SIZE[1]
@@ -245,9 +273,9 @@ def _lighting(rng: np.random.Generator) -> Lighting:
 # --- BOP files --------------------------------------------------------------------------------------------------
 
 
-def write_clutter(folder: Path, catalogue: Catalogue, *, scenes: int, seed: int) -> None:
+def write_clutter(folder: Path, catalogue: Catalogue, *, scenes: int, seed: int, pile: Pile = CLUTTER_15) -> None:
     """Writes models, ``scenes`` images, truth, targets and detections; the same bytes for the same seed."""
-    clutter = Clutter(catalogue, seed=seed)
+    clutter = Clutter(catalogue, seed=seed, pile=pile)
     write_models(folder / "models", catalogue)
     targets: list[Any] = []
     exact: list[Any] = []
@@ -261,7 +289,7 @@ def write_clutter(folder: Path, catalogue: Catalogue, *, scenes: int, seed: int)
         exact += [_detection(index + 1, *each, 1.0) for each in zip(numbers, boxes, strict=True)]
         others = [item.label for item in catalogue.objects.values() if item.label not in numbers]
         rng = np.random.default_rng([seed, 2, index])
-        noisy += [_detection(index + 1, *each) for each in _noisy(numbers, boxes, others, rng)]
+        noisy += [_detection(index + 1, *each) for each in _noisy(numbers, boxes, others, pile, rng)]
     clutter.close()
     _write_json(folder / TARGETS, targets)
     _write_json(folder / "detections_exact.json", exact)
@@ -338,16 +366,18 @@ def _truth(T_camera_object: Floats, number: int) -> dict[str, Any]:
 
 
 def _noisy(
-    numbers: Sequence[int], boxes: Sequence[Sequence[float]], others: Sequence[int], rng: np.random.Generator
-) -> list[tuple[int, list[float], float]]:
-    """Jittered true boxes, and two or three false ones of objects that are not there, mostly on others' boxes."""
+    numbers: Sequence[int], boxes: Sequence[Sequence[float]], others: Sequence[int], pile: Pile,
+    rng: np.random.Generator,
+) -> list[tuple[int, list[float], float]]:  # fmt: skip
+    """Jittered true boxes, and a few false ones of objects that are not there, mostly on others' boxes."""
     found = [
-        (number, _jittered(box, 0.05, rng), float(rng.uniform(0.6, 1.0)))
+        (number, _jittered(box, pile.jitter, rng), float(rng.uniform(0.6, 1.0)))
         for number, box in zip(numbers, boxes, strict=True)
     ]
-    false = rng.permutation(np.asarray(others))[: int(rng.integers(2, 4))]
+    least, greatest = pile.false
+    false = rng.permutation(np.asarray(others))[: int(rng.integers(least, greatest + 1))]
     for number in false:
-        box = _jittered(boxes[int(rng.integers(len(boxes)))], 0.1, rng)
+        box = _jittered(boxes[int(rng.integers(len(boxes)))], 2 * pile.jitter, rng)
         if rng.random() < 0.25:
             box[:2] = (np.asarray(box[:2]) + rng.normal(0, 60, 2)).clip(0, np.array(SIZE) - box[2:]).tolist()
         found.append((int(number), box, float(rng.uniform(0.35, 0.95))))

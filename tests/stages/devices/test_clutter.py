@@ -10,7 +10,7 @@ import pytest
 from benchmarks.clutter import sheet
 from benchmarks.datasets import images, truths_by_image
 from stages.devices.bop import read_dataset
-from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, write_clutter
+from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, Pile, write_clutter
 from stages.perception.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Catalogue
 
@@ -104,3 +104,18 @@ def test_the_sheet_shows_every_image(dataset: Path) -> None:
     pixels = np.asarray(sheet(dataset))
     assert pixels.shape[0] == 195 and (pixels[:, :255].std(), pixels[:, 259:514].std()) > (1, 1)
     assert (pixels[:, 514:] == 255).all()
+
+
+def test_a_pile_of_its_own_holds_what_it_says(tmp_path: Path) -> None:
+    labels = ("mug", "soup_can", "tea_box", "sugar_box")
+    pile = Pile(counts=(3,), labels=labels, least_visible=0.05, distance=(1.5, 1.6), jitter=0.0, false=(4, 4))
+    write_clutter(tmp_path, CATALOGUE, scenes=2, seed=5, pile=pile)
+    known = {CATALOGUE[label].label for label in labels}
+    exact = images(tmp_path, tmp_path / "detections_exact.json")
+    noisy = images(tmp_path, tmp_path / "detections_noisy.json")
+    for image, other in zip(exact, noisy, strict=True):
+        assert len(image.truths) == 3 and {truth.label for truth in image.truths} <= known
+        assert all(truth.visible >= 0.05 and truth.T_camera_object[2, 3] > 1.2 for truth in image.truths)
+        assert len(other.boxes) == 3 + 4
+        for a, b in zip(image.boxes, other.boxes, strict=False):
+            np.testing.assert_allclose(a.box, b.box)
