@@ -8,6 +8,7 @@
 ``RUN/gone/STAGE/REPLICA/INCARNATION``     the recorder's word that it has all that a dead process has sent
 ``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
 ``RUN/l/STAGE``                            log lines (LogLine)
+``RUN/h/STAGE/REPLICA``                    a sign of life twice a second (Pulse); not recorded
 ``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers
 ``RUN/flush``                              query answered by the recorder once it has everything sent before
 ``RUN/q/NAME``                             question to the supervisor (status, down, restart, call), answered in JSON

@@ -17,6 +17,8 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 Outcome = Literal["done", "stopped", "failed"]
 """How a step ended: only ``done`` acknowledges what it consumed."""
+Activity = Literal["waiting", "working", "held back"]
+"""What a process does: wait for input, run a handler, or wait for room at its consumers."""
 MAX_BYTES = 256 * 2**20
 """Largest payload that is decoded."""
 MAX_DIMENSIONS = 8
@@ -104,6 +106,37 @@ class LogLine(msgspec.Struct, frozen=True):
     text: str
     time_ns: int
     """Wall clock, nanoseconds since the epoch."""
+
+
+class Pulse(msgspec.Struct, frozen=True):
+    """What a process says of itself twice a second, of the recorder too; it is not recorded."""
+
+    stage: str
+    replica: int
+    incarnation: int
+    pid: int
+    host: str
+    """Name of the machine."""
+    state: Activity = "waiting"
+    handler: str = ""
+    """What runs at present; empty while waiting."""
+    busy_ns: int = 0
+    """Time spent inside the present handler, back-pressure not counted."""
+    steps: int = 0
+    refused: int = 0
+    """Messages that could not be taken."""
+    queued: dict[str, int] = {}
+    """Messages that have arrived and are not worked on, by input port."""
+    skipped: dict[str, int] = {}
+    """Messages that newer ones replaced before they were read, by input port."""
+    unanswered: dict[str, int] = {}
+    """Messages that consumers have not done with, by ``stage.port`` of the consumer."""
+    sent: dict[str, tuple[int, int]] = {}
+    """(messages, bytes) emitted so far, by output port."""
+    cpu_ns: int = 0
+    """Processor time of all its threads since it began."""
+    memory_bytes: int = 0
+    """What it holds in memory (resident set)."""
 
 
 # ---------------------------------------------------------------------------------------------- arrays
@@ -262,13 +295,13 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     return message
 
 
-def pack(record: Envelope | Step | Receipt | LogLine) -> bytes:
+def pack(record: Envelope | Step | Receipt | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike."""
     return _encoder().encode(record)
 
 
 def unpack(kind: type[R], payload: bytes) -> R:
-    """Reads an Envelope, Step, Receipt or LogLine; raises CodecError and nothing else, whatever the bytes."""
+    """Reads an Envelope, Step, Receipt, LogLine or Pulse; raises CodecError and nothing else, whatever the bytes."""
     return _decode(kind, payload)
 
 

@@ -66,6 +66,11 @@ class Outgoing:
         if message_id in self._pending:
             self._pending[message_id].received = True
 
+    @property
+    def unanswered(self) -> int:
+        """Messages that the consumer has not done with."""
+        return len(self._pending)
+
     def oldest(self) -> str:
         """Id of the message that has waited longest."""
         return next(iter(self._pending), "")
@@ -149,6 +154,10 @@ class Delivery:
                 with self._changed:
                     self._wait_for_room(edge, envelope.lineage)
                     edge.accept(_Entry(envelope.id, envelope.lineage, payload))
+
+    def unanswered(self) -> dict[str, int]:
+        """Messages that consumers have not done with, by ``stage.port``; waits for nobody, not even a full link."""
+        return {f"{edge.route.consumer}.{edge.route.input}": edge.unanswered for edge in self._edges}
 
     def after_arrival(self, message_ids: tuple[str, ...], action: Callable[[], None]) -> None:
         """Acts, in the order of these calls, once messages have arrived wherever they go.

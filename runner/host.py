@@ -24,6 +24,7 @@ from runner.codec import CodecError, Envelope, LogLine, Outcome, Receipt, Step
 from runner.contract import Level, Refused
 from runner.delivery import Delivery, Stopped
 from runner.graph import Route, node_from_entry
+from runner.health import Heart
 from runner.inbox import Inbox, Mismatched, Ready
 from runner.ports import Handler
 from runner.step import Executor, receive, step_time
@@ -87,6 +88,13 @@ class Host:
         self._remember(assignment.consumed)
         self._refused = 0
         self._steps = 0
+        self._received = dict.fromkeys(self._node.inputs, 0)
+        """Messages by port; the bus' thread counts these, the main thread those that it has decoded."""
+        self._decoded = dict.fromkeys(self._node.inputs, 0)
+        self._present: _Record | None = None
+        """The step that runs."""
+        self._sent: dict[str, tuple[int, int]] = dict.fromkeys(self._node.type.outputs, (0, 0))
+        self._heart = Heart(self._process, self._bus, self._vitals)
 
     def run(self) -> None:
         """Serves until it is stopped; raises what a handler raises."""
@@ -105,6 +113,7 @@ class Host:
         """Lets the recorder catch up, then releases the stage and the bus."""
         self._say_what_is_left()
         self._delivery.close()
+        self._heart.stop()
         self._bus.flush()
         self._stage.close()
         self._bus.close()
@@ -118,7 +127,24 @@ class Host:
             self._bus.subscribe(f"r/{consumer}", self._on_receipt)
         self._bus.subscribe(f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery)
         self._bus.watch(self._on_presence)
+        self._heart.start()
         self._bus.announce(self._process)
+
+    def _vitals(self) -> dict[str, Any]:
+        """What the pulse says beyond what holds for any process. Runs on the pulse's thread and waits for nobody."""
+        record, queued = self._present, self._inbox.waiting
+        working = record is not None and record.computing
+        return {
+            "state": "waiting" if record is None else "working" if working else "held back",
+            "handler": "" if record is None else record.handler,
+            "busy_ns": 0 if record is None else record.busy_ns,
+            "steps": self._steps,
+            "refused": self._refused,
+            "queued": {port: self._received[port] - self._decoded[port] + waiting for port, waiting in queued.items()},
+            "skipped": dict(self._inbox.skipped),
+            "unanswered": self._delivery.unanswered(),
+            "sent": dict(self._sent),
+        }
 
     def _on_presence(self, process: Process, present: bool) -> None:
         self._presence.update(process, present)
@@ -144,6 +170,8 @@ class Host:
             port = packet.key.rpartition("/")[2]
             receipt = Receipt(port, envelope.id, consumed=self._arrived.get((port, envelope.id), False))
             self._bus.publish(f"r/{self._process.stage}", codec.pack(receipt))
+            if port in self._received:
+                self._received[port] += 1
             self._deliveries.put(_Delivered(packet, port, envelope))
 
     def _read(self, kind: type[R], packet: Packet) -> R | None:
@@ -161,6 +189,8 @@ class Host:
     def _take(self, delivered: "_Delivered") -> None:
         """Decodes one message into the inbox, unless it has been here before."""
         packet, envelope = delivered.packet, delivered.envelope
+        if delivered.port in self._decoded:
+            self._decoded[delivered.port] += 1
         if (delivered.port, envelope.id) in self._arrived:
             return
         try:
@@ -203,7 +233,7 @@ class Host:
         """Runs one handler to its end and journals it."""
         time_ns = step_time(self._node, ready.arrivals, time.time_ns())
         emissions = self._executor.run(ready.handler, ready.arrivals, time_ns)
-        record = _Record(ready, time_ns)
+        self._present = record = _Record(ready, time_ns)
         try:
             for envelope in record.timed(emissions):
                 self._emit(envelope)
@@ -215,17 +245,19 @@ class Host:
             record.outcome, record.error = "failed", _summary(error)
             raise
         finally:
+            self._present = None
             self._journal(record)
 
     def _advance(self, handler: Handler) -> Iterator[bool]:
         """Sends the next message of the source each time it is advanced; every message is a step."""
         emissions = self._executor.advance(handler, time.time_ns)
         while True:
-            record = _Record(Ready(handler, ()), time.time_ns())
+            self._present = record = _Record(Ready(handler, ()), time.time_ns())
             for envelope in record.timed(itertools.islice(emissions, 1)):
                 record.time_ns = envelope.time_ns
                 with contextlib.suppress(Stopped):
                     self._emit(envelope)
+            self._present = None
             if not record.emitted:
                 return
             self._journal(record)
@@ -235,6 +267,8 @@ class Host:
         """Sends a message, to the recorder first."""
         payload = codec.pack(envelope)
         port = envelope.id.partition("#")[0].rpartition(".")[2]
+        messages, size = self._sent[port]
+        self._sent[port] = messages + 1, size + len(payload)
         self._bus.publish(f"m/{self._process.stage}/{port}", payload)
         self._delivery.publish(port, envelope, payload)
 
@@ -250,8 +284,9 @@ class Host:
         """Records what was never worked on."""
         for handler, lineage, lacking in self._inbox.incomplete():
             self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-        if self._inbox.skipped:
-            self._log(f"{self._inbox.skipped} messages were replaced by newer ones before they were read", "debug")
+        for port, skipped in self._inbox.skipped.items():
+            if skipped:
+                self._log(f"{port}: {skipped} messages were replaced by newer ones before they were read", "debug")
 
     def _remember(self, consumed: Iterable[tuple[str, str]]) -> None:
         for key in consumed:
@@ -283,19 +318,37 @@ class _Record:
         self._ready = ready
         self._started_ns = time.monotonic_ns()
         self._computed_ns = 0
+        self._begun_ns = 0
+        """When the handler went on; 0 while it is held back."""
         self.time_ns = time_ns
         self.emitted: list[str] = []
         self.outcome: Outcome = "done"
         self.error = ""
 
+    @property
+    def handler(self) -> str:
+        """What runs."""
+        return self._ready.handler.name
+
+    @property
+    def computing(self) -> bool:
+        """Whether the handler runs, rather than what it emitted being sent."""
+        return self._begun_ns > 0
+
+    @property
+    def busy_ns(self) -> int:
+        """Time inside the handler so far. May be read from any thread."""
+        begun = self._begun_ns
+        return self._computed_ns + (time.monotonic_ns() - begun if begun else 0)
+
     def timed(self, emissions: Iterator[Envelope]) -> Iterator[Envelope]:
         """Passes emissions on, noting their ids and the time the handler took for them."""
         while True:
-            begun = time.monotonic_ns()
+            self._begun_ns = time.monotonic_ns()
             try:
                 envelope = next(emissions, None)
             finally:
-                self._computed_ns += time.monotonic_ns() - begun
+                self._computed_ns, self._begun_ns = self.busy_ns, 0
             if envelope is None:
                 return
             self.emitted.append(envelope.id)

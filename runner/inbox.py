@@ -39,8 +39,10 @@ class Inbox:
         self._lineages = {handler.name: OrderedDict[str, _Lineage]() for handler in node.type.handlers}
         self._turns = {handler.name: deque[str]() for handler in node.type.handlers}
         self._ready: deque[Ready] = deque()
-        self.skipped = 0
-        """Messages that a newer one replaced, on edges of policy ``latest``."""
+        self.waiting = dict.fromkeys(node.inputs, 0)
+        """Messages that no step has taken yet, by port; not those that a join keeps for its parts."""
+        self.skipped = dict.fromkeys(node.inputs, 0)
+        """Messages that a newer one replaced, by port, on edges of policy ``latest``."""
 
     def add(self, arrival: Arrival) -> None:
         """Takes a message; raises Mismatched for a part that contradicts its siblings."""
@@ -52,6 +54,7 @@ class Inbox:
         if arrival.port.kind == "gather":
             _check_siblings(arrival, waiting)
         waiting.append(arrival)
+        self._count(handler, arrival.port, 1)
         if arrival.port == _turn_port(handler):
             self._turns[handler.name].append(arrival.envelope.lineage)
         self._ready.extend(self._complete(handler, arrival.envelope.lineage))
@@ -64,7 +67,12 @@ class Inbox:
 
     def pop(self) -> Ready | None:
         """The next step in order of completion, or None."""
-        return self._ready.popleft() if self._ready else None
+        if not self._ready:
+            return None
+        ready = self._ready.popleft()
+        for arrival in ready.arrivals:
+            self._count(ready.handler, arrival.port, -1)
+        return ready
 
     def incomplete(self) -> Iterator[tuple[Handler, str, list[str]]]:
         """(handler, lineage, ports that lack) for everything that cannot run yet."""
@@ -93,13 +101,21 @@ class Inbox:
 
     def _discard_older(self, handler: Handler, port: InputPort) -> None:
         for lineage in self._lineages[handler.name].values():
-            self.skipped += len(lineage.waiting.pop(port.name, ()))
+            self._skip(handler, port, len(lineage.waiting.pop(port.name, ())))
         if port == _turn_port(handler):
             self._turns[handler.name].clear()
         if len(handler.inputs) == 1:
             kept = [ready for ready in self._ready if ready.handler is not handler]
-            self.skipped += len(self._ready) - len(kept)
+            self._skip(handler, port, len(self._ready) - len(kept))
             self._ready = deque(kept)
+
+    def _skip(self, handler: Handler, port: InputPort, number: int) -> None:
+        self.skipped[port.name] += number
+        self._count(handler, port, -number)
+
+    def _count(self, handler: Handler, port: InputPort, number: int) -> None:
+        if not handler.keeps(port):
+            self.waiting[port.name] += number
 
     def _forget_oldest(self, handler: Handler) -> None:
         """Drops the oldest lineages of which only what stays is left: their parts have been worked on."""

@@ -22,6 +22,7 @@ from runner.children import die_with_parent
 from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
 from runner.contract import Message, Refused
+from runner.health import Heart
 from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording import JOURNAL, LOG, PROFILE, RUN, VERDICT, Ledger, Verdict, replicated, split_id, topic_of
 
@@ -112,6 +113,8 @@ class RecordingWriter:
         self._waiting_bytes = 0
         self._problems: list[str] = []
         self._dropped = 0
+        self._recorded = 0
+        self._malformed = 0
         self._thread = threading.Thread(target=self._write_all, name="recording", daemon=True)
         self._thread.start()
 
@@ -123,6 +126,15 @@ class RecordingWriter:
                 return
             self._waiting_bytes += len(data)
         self._queue.put(_Payload(kind, data, time.time_ns()))
+
+    def vitals(self) -> dict[str, Any]:
+        """What the recorder's pulse says: records that are written, were refused and wait for the disk."""
+        return {
+            "state": "working" if self._queue.qsize() else "waiting",
+            "steps": self._recorded,
+            "refused": self._malformed,
+            "queued": {"disk": self._queue.qsize()},
+        }
 
     def close(self) -> Verdict:
         """Writes what is waiting, the verdict and the end of the file."""
@@ -160,6 +172,7 @@ class RecordingWriter:
         try:
             record = unpack(payload.kind, payload.data)
         except CodecError as error:
+            self._malformed += 1
             self._refuse(f"a malformed {payload.kind.__name__} was not recorded: {error}")
             return
         match record:
@@ -173,6 +186,7 @@ class RecordingWriter:
                 self._add(LOG + record.stage, "LogLine", payload, record.time_ns, 0)
 
     def _add(self, topic: str, kind: str, payload: _Payload, time_ns: int, sequence: int) -> None:
+        self._recorded += 1
         channel = self._channels.get(topic) or self._register(topic, kind)
         self._writer.add_message(channel, payload.received_ns, payload.data, time_ns, sequence % 2**32)
 
@@ -222,6 +236,7 @@ class Recorder:
         self._writer = RecordingWriter(manifest, self._complain)
         self._echoes: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
         self._echo = threading.Thread(target=self._echo_all, name="echo", daemon=True)
+        self._heart = Heart(Process(RECORDER, 0), self._bus, self._writer.vitals)
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
@@ -232,7 +247,9 @@ class Recorder:
         self._bus.watch(self._on_presence)
         self._bus.answer_flush()
         self._bus.announce(Process(RECORDER, 0))
+        self._heart.start()
         self._stopping.wait()
+        self._heart.stop()
         self._echoes.put(None)
         self._echo.join(FLUSH_SECONDS)
         self._bus.close()

@@ -21,6 +21,7 @@ from runner.codec import CodecError, Envelope, LogLine, Receipt, Step
 from runner.contract import Finished, Level, Refused, Restarted
 from runner.delivery import Delivery
 from runner.graph import FINISHED, SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.health import Pulses
 from runner.host import EXIT_REFUSED, Assignment
 from runner.info import stage_times
 from runner.ports import port_name
@@ -116,6 +117,7 @@ class Supervisor:
         self._recorder: _Child | None = None
         self._viewer: _Child | None = None
         self._presence = Presence()
+        self._pulses = Pulses()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
         self._restarts = 0
@@ -147,6 +149,7 @@ class Supervisor:
         self._bus.subscribe("l/*", self._on_log)
         self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
         self._bus.subscribe("gone/*/*/*", self._on_gone)
+        self._bus.subscribe("h/*/*", self._on_pulse)
         self._bus.serve("status", lambda _: msgspec.json.encode(self._status()))
         self._bus.watch(self._on_presence)
 
@@ -180,6 +183,10 @@ class Supervisor:
 
     def _on_gone(self, packet: Packet) -> None:
         self._settled.add(Process.of(packet.key))
+
+    def _on_pulse(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            self._pulses.note(packet.payload)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         self._delivery.update(process, present)
