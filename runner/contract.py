@@ -124,5 +124,9 @@ class Stage:
     device: ClassVar[bool] = False
     """True where the stage touches the outside: replay substitutes its recorded messages."""
 
+    stateful: ClassVar[bool] = False
+    """True where what a handler does depends on earlier steps. A restarted process then executes again, silently,
+    what its predecessors did, and a replay does the same. Devices cannot: their past lies outside."""
+
     def close(self) -> None:
         """Releases what ``__init__`` took. Called once, on every orderly shutdown."""

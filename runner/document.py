@@ -10,6 +10,8 @@ import yaml
 
 from runner.contract import Refused
 
+OWN_KEYS = ("replicas", "restarts", "heartbeat", "timeout", "startup", "memory")
+"""Keys of a stage beside its settings that ``--set`` reaches."""
 Keys = tuple[str, ...]
 """Where a value stands: ("stages", "camera", "config", "dataset")."""
 
@@ -60,7 +62,7 @@ class Document:
         stages = cast("dict[str, Any]", self.values.get("stages") or {})
         if stage not in stages:
             raise Refused(f"--set {key}: no stage {stage!r}{suggest(stage, stages)}")
-        if setting in ("replicas", "restarts"):
+        if setting in OWN_KEYS:
             return ("stages", stage, setting)
         return ("stages", stage, "config", *setting.split("."))
 

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import math
 import os
 import pkgutil
 import re
@@ -55,6 +56,17 @@ class StageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restarts: Annotated[
         Annotated[int, Meta(ge=0)] | None, Meta(description="Crashes of a process before the graph ends")
     ] = None
+    heartbeat: Annotated[
+        float, Meta(gt=0, description="Seconds without a sign of life after which a process counts as hung")
+    ] = 30.0
+    timeout: Annotated[
+        float, Meta(gt=0, description="Seconds a handler may compute; time held back by consumers does not count")
+    ] = 300.0
+    startup: Annotated[float, Meta(gt=0, description="Seconds until a process must be ready")] = 180.0
+    memory: Annotated[
+        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$")] | None,
+        Meta(description="What a process may hold, for example 2GB"),
+    ] = None
 
 
 class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,6 +88,26 @@ class Edge:
     queue: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a process may do before it is taken for hung, in seconds, or for out of bounds."""
+
+    heartbeat: float = 30.0
+    """Without a pulse. Long: code that keeps the interpreter to itself is slow, not dead."""
+    timeout: float = 300.0
+    """Inside one handler. A device's source may wait for the world as long as it likes."""
+    startup: float = 180.0
+    memory: str | None = None
+    """Resident, for example ``2GB``."""
+
+    @property
+    def memory_bytes(self) -> float:
+        """The same as a number; infinite where none is set."""
+        if self.memory is None:
+            return math.inf
+        return float(self.memory[:-2]) * 1000 ** " kMGT".index(self.memory[-2])
+
+
 @dataclass(frozen=True, slots=True)
 class Node:
     """One stage of a checked graph."""
@@ -88,6 +120,7 @@ class Node:
     inputs: dict[str, Edge]
     replicas: int
     restarts: int
+    limits: Limits = Limits()
 
     @property
     def replicated(self) -> bool:
@@ -179,6 +212,10 @@ def node_entry(node: Node) -> dict[str, Any]:
         },
         "replicas": node.replicas,
         "restarts": node.restarts,
+        "heartbeat": node.limits.heartbeat,
+        "timeout": node.limits.timeout,
+        "startup": node.limits.startup,
+        "memory": node.limits.memory,
     }
 
 
@@ -405,7 +442,12 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
     if entry.replicas != 1 and not parts:
         raise Refused(f"{document.place(*keys, 'replicas')}: {entry.stage} takes no Part, which is what replicas share")
     restarts = entry.restarts if entry.restarts is not None else 0 if kind.cls.device else RESTARTS
-    return Node(name, entry.stage, kind, config, _edges(document, name, entry, kind), replicas, restarts)
+    if kind.cls.stateful and replicas > 1:
+        place = document.place(*keys, "replicas")
+        raise Refused(f"{place}: {entry.stage} is stateful: replicas would remember different things; valid: 1")
+    edges = _edges(document, name, entry, kind)
+    limits = Limits(heartbeat=entry.heartbeat, timeout=entry.timeout, startup=entry.startup, memory=entry.memory)
+    return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits)
 
 
 # ---------------------------------------------------------------------------------------------- edges
