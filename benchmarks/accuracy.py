@@ -29,6 +29,7 @@ from stages.perception.metrics import (
     average_recall,
     is_near_flip,
     mssd,
+    nearest_symmetries,
     pose_errors,
     vsd,
 )
@@ -95,7 +96,6 @@ class _Judge:
         vertices = item.mesh.vertices
         self._item = item
         self._points = vertices[:: max(1, len(vertices) // _POINTS)]
-        self._symmetries = item.symmetries.transforms()
         self._prepared: tuple[Floats, float, Floats, Soup] | None = None
 
     def adds(self, truth: Truth, result: Result) -> float:
@@ -104,8 +104,9 @@ class _Judge:
     def score(self, truth: Truth, result: Result, view: tuple[Depth, Intrinsics] | None) -> Score:
         T, T_true = result.T_camera_object, truth.T_camera_object
         corners, diameter, symmetries, soup = self._prepare()
-        metres, radians = pose_errors(T, T_true, self._symmetries)
-        flip = is_near_flip(T, T_true, self._item.symmetries, tolerance=_FLIP)
+        exact = self._item.symmetries
+        metres, radians = pose_errors(T, T_true, nearest_symmetries(T, T_true, exact))
+        flip = is_near_flip(T, T_true, exact, tolerance=_FLIP)
         farthest = mssd(T, T_true, corners, symmetries) / diameter
         seen = None if view is None else _vsd((T, T_true), soup, view, diameter)
         return Score(truth, self.adds(truth, result), metres, radians, flip, farthest, seen, result)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from stages.messages.arrays import Intrinsics
-from stages.perception.poses import rotation_angle, symmetry_angle
+from stages.perception.poses import exp_so3, pose, rotation_angle, symmetry_angle
 from stages.scene.catalogue import Floats, Symmetries
 
 Image = NDArray[np.floating]
@@ -104,6 +104,31 @@ def pose_errors(T_estimate: Floats, T_true: Floats, symmetries: Floats) -> tuple
     offsets = np.linalg.norm(equivalents[:, :3, 3] - T_estimate[:3, 3], axis=1)
     best = int(np.lexsort((offsets, np.round(angles, 9)))[0])
     return float(offsets[best]), float(angles[best])
+
+
+def nearest_symmetries(T_estimate: Floats, T_true: Floats, symmetries: Symmetries) -> Floats:
+    """The symmetry transforms that matter for a pair of 4 x 4 poses, identity first, S x 4 x 4.
+
+    They are the discrete ones and, about every continuous axis, each of these with the turn that brings the true
+    pose nearest to the estimate. A sampled axis would add up to half of its step to every rotation error.
+    """
+    discrete = np.concatenate([np.eye(4)[None], symmetries.discrete.reshape(-1, 4, 4)])
+    turned = [
+        symmetry @ _turn_towards(T_estimate[:3, :3], (T_true @ symmetry)[:3, :3], axis, offset)
+        for axis, offset in symmetries.continuous
+        for symmetry in discrete
+    ]
+    return np.concatenate([discrete, np.reshape(turned, (-1, 4, 4))])
+
+
+def _turn_towards(R_estimate: Floats, R_true: Floats, axis: Floats, offset: Floats) -> Floats:
+    """The turn about a line of the object frame that brings one rotation nearest to another (swing and twist)."""
+    R = R_true.T @ R_estimate
+    # The trace of turn^T R is largest, so the angle between them least, at this angle.
+    sine = float(axis @ [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    cosine = float(np.trace(R) - axis @ R @ axis)
+    turn = exp_so3(np.arctan2(sine, cosine) * axis)
+    return pose(turn, offset - turn @ offset)
 
 
 def is_near_flip(T_estimate: Floats, T_true: Floats, symmetries: Symmetries, *, tolerance: float) -> bool:

@@ -10,6 +10,7 @@ from stages.perception.metrics import (
     average_recall,
     is_near_flip,
     mssd,
+    nearest_symmetries,
     pose_errors,
     vsd,
 )
@@ -40,6 +41,19 @@ def test_errors_modulo_symmetry() -> None:
 def test_a_symmetry_about_an_axis_off_the_origin_moves_the_origin() -> None:
     turn = pose(np.diag([-1.0, -1.0, 1.0]), np.array([0.2, 0.0, 0.0]))
     assert pose_errors(turn, np.eye(4), np.stack([np.eye(4), turn])) == pytest.approx((0, 0), abs=1e-9)
+
+
+def test_a_turn_about_a_continuous_axis_is_no_error_whatever_its_angle() -> None:
+    offset = np.array([0.3, 0.0, 0.0])  # The axis does not go through the origin.
+    over = pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    can = Symmetries(discrete=over[None], continuous=((np.array([0.0, 0.0, 1.0]), offset),), near=np.zeros((0, 4, 4)))
+    turn = exp_so3(np.array([0.0, 0.0, 0.6123]))
+    tilt = pose(exp_so3(np.array([0.0, 0.05, 0.0])), np.zeros(3))
+    T_true = pose(exp_so3(np.array([0.4, -0.2, 1.0])), np.array([0.1, 0.2, 0.9]))
+    turned = T_true @ over @ pose(turn, offset - turn @ offset)
+    assert pose_errors(turned, T_true, nearest_symmetries(turned, T_true, can)) == pytest.approx((0, 0), abs=1e-9)
+    tilted = turned @ tilt
+    assert pose_errors(tilted, T_true, nearest_symmetries(tilted, T_true, can))[1] == pytest.approx(0.05)
 
 
 def test_a_near_flip_is_told_from_a_random_error() -> None:
