@@ -26,6 +26,10 @@ class Difference:
     """For arrays: how many elements differ, and by how much at most."""
     largest: float | None = None
     """Largest absolute difference of numbers; infinite between a number and NaN, None where they are no numbers."""
+    owner: str = ""
+    """``Type.field`` of the struct that declares the field."""
+    share: float = 1.0
+    """Of an array's elements that differ."""
 
     @property
     def pattern(self) -> str:
@@ -37,40 +41,47 @@ class Difference:
         return f"{self.field}: recorded {self.recorded}, replayed {self.replayed}{extent}"
 
 
-def differences(recorded: Any, replayed: Any, field: str = "") -> Iterator[Difference]:
+def differences(recorded: Any, replayed: Any, field: str = "", owner: str = "") -> Iterator[Difference]:
     """Every field that differs, in the order of declaration. Floats are compared bit by bit: NaN equals NaN."""
     if type(recorded) is not type(replayed):
-        yield Difference(field, _show(recorded), _show(replayed), "types differ")
+        yield Difference(field, _show(recorded), _show(replayed), "types differ", owner=owner)
     elif isinstance(recorded, msgspec.Struct):
         for name in recorded.__struct_fields__:
-            yield from differences(getattr(recorded, name), getattr(replayed, name), f"{field}.{name}".lstrip("."))
+            pair, place = (getattr(recorded, name), getattr(replayed, name)), f"{field}.{name}".lstrip(".")
+            yield from differences(*pair, place, f"{type(recorded).__name__}.{name}")
     elif isinstance(recorded, np.ndarray):
-        yield from _array_difference(cast("NDArray[Any]", recorded), cast("NDArray[Any]", replayed), field)
+        yield from _array_difference(cast("NDArray[Any]", recorded), cast("NDArray[Any]", replayed), field, owner)
     elif isinstance(recorded, dict):
-        yield from _mapping_differences(cast("dict[Any, Any]", recorded), cast("dict[Any, Any]", replayed), field)
+        yield from _mapping_differences(
+            cast("dict[Any, Any]", recorded), cast("dict[Any, Any]", replayed), field, owner
+        )
     elif isinstance(recorded, list | tuple):
-        yield from _sequence_differences(cast("Sequence[Any]", recorded), cast("Sequence[Any]", replayed), field)
+        yield from _sequence_differences(cast("Sequence[Any]", recorded), cast("Sequence[Any]", replayed), field, owner)
     elif repr(recorded) != repr(replayed):
-        yield Difference(field, _show(recorded), _show(replayed), largest=_gap(recorded, replayed))
+        yield Difference(field, _show(recorded), _show(replayed), largest=_gap(recorded, replayed), owner=owner)
 
 
-def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str) -> Iterator[Difference]:
+def _mapping_differences(
+    recorded: dict[Any, Any], replayed: dict[Any, Any], field: str, owner: str
+) -> Iterator[Difference]:
     if recorded.keys() != replayed.keys():
-        yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ")
+        yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ", owner=owner)
     for key in filter(replayed.__contains__, recorded):
-        yield from differences(recorded[key], replayed[key], f"{field}[{key!r}]")
+        yield from differences(recorded[key], replayed[key], f"{field}[{key!r}]", owner)
 
 
-def _sequence_differences(recorded: Sequence[Any], replayed: Sequence[Any], field: str) -> Iterator[Difference]:
+def _sequence_differences(
+    recorded: Sequence[Any], replayed: Sequence[Any], field: str, owner: str
+) -> Iterator[Difference]:
     if len(recorded) != len(replayed):
-        yield Difference(field, f"{len(recorded)} items", f"{len(replayed)} items", "lengths differ")
+        yield Difference(field, f"{len(recorded)} items", f"{len(replayed)} items", "lengths differ", owner=owner)
     for index, pair in enumerate(zip(recorded, replayed, strict=False)):
-        yield from differences(*pair, f"{field}[{index}]")
+        yield from differences(*pair, f"{field}[{index}]", owner)
 
 
-def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str) -> Iterator[Difference]:
+def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str, owner: str) -> Iterator[Difference]:
     if recorded.dtype != replayed.dtype or recorded.shape != replayed.shape:
-        yield Difference(field, _kind(recorded), _kind(replayed), "element types or shapes differ")
+        yield Difference(field, _kind(recorded), _kind(replayed), "element types or shapes differ", owner=owner)
         return
     unequal = _bits(recorded) != _bits(replayed)
     if not unequal.any():
@@ -79,7 +90,8 @@ def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str
     largest = _largest(recorded[unequal], replayed[unequal])
     extent = f"{np.count_nonzero(unequal)} of {unequal.size} elements differ, by {largest:.3g} at most"
     place = f"{field}[{', '.join(map(str, first))}]"
-    yield Difference(place, _show(recorded[first].item()), _show(replayed[first].item()), extent, largest)
+    share = np.count_nonzero(unequal) / unequal.size
+    yield Difference(place, _show(recorded[first].item()), _show(replayed[first].item()), extent, largest, owner, share)
 
 
 def _bits(array: NDArray[Any]) -> NDArray[Any]:
