@@ -24,6 +24,7 @@ was journalled or its part was handed to another replica: readers tell by the id
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import queue
@@ -33,17 +34,23 @@ import sys
 import threading
 import time
 import traceback
+import uuid
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
 
 from runner.contract import Refused
+from runner.network import Network
+from runner.security import security
 
 A = TypeVar("A")
 
+LEASE_MS = 5000
+"""A host of which nothing is heard for so long is cut off."""
 BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 FLUSH_SECONDS = 1.0
@@ -81,8 +88,22 @@ class Packet:
     key: str
     payload: bytes
     sent_ns: int
-    """Monotonic clock of this machine when it was sent; 0 where the sender did not say."""
+    """Monotonic clock of this machine when it was sent; 0 where the sender did not say or has another clock."""
     arrived_ns: int
+
+
+_SENT = struct.Struct("<qQ")
+"""What accompanies a message: when it was sent, and by which clock."""
+
+
+def _clock() -> int:
+    """Names the monotonic clock of this machine: it starts anew with every boot."""
+    boot = Path("/proc/sys/kernel/random/boot_id")
+    seed = boot.read_bytes() if boot.exists() else str(uuid.getnode()).encode()
+    return int.from_bytes(hashlib.sha256(seed).digest()[:8], "little")
+
+
+_CLOCK = _clock()
 
 
 class Bus:
@@ -92,9 +113,15 @@ class Bus:
     subscription on a thread of its own, and a step could overtake what it emitted.
     """
 
-    def __init__(self, run: str, *, listen: str = "tcp/127.0.0.1:0", connect: str | None = None):
+    def __init__(
+        self, run: str, *, listen: str | None = None, connect: str | None = None, network: Network | None = None
+    ):
+        """``connect`` is called first; without a ``network`` all of it stays on loopback.
+
+        Raises Refused where this machine cannot listen as it is told.
+        """
         self._run = run
-        self._session = zenoh.open(_config(listen, connect))
+        self._session = _open(_config(listen, connect, network))
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -111,7 +138,7 @@ class Bus:
                 reliability=zenoh.Reliability.RELIABLE,
             )
             self._publishers[path] = publisher
-        publisher.put(payload, attachment=struct.pack("<q", time.monotonic_ns()))
+        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
 
     def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
         """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed)."""
@@ -247,16 +274,48 @@ def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> No
             query.reply_err(f"{type(error).__name__}: {error}", encoding=REFUSAL)
 
 
-def _config(listen: str, connect: str | None) -> zenoh.Config:
-    settings = {
-        "mode": "peer",
-        "listen/endpoints": [listen],
+class Router:
+    """Where the sessions of a routed network meet: it forwards between those that do not link to each other."""
+
+    def __init__(self, endpoint: str, network: Network):
+        """Raises Refused where this machine cannot listen there."""
+        self._session = _open(_config(endpoint, None, network, mode="router"))
+
+    def close(self) -> None:
+        """Lets everybody go."""
+        self._session.close()
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        where = json.loads(config.get_json("listen/endpoints")) or json.loads(config.get_json("connect/endpoints"))
+        reason = str(error).partition(" at /")[0]
+        raise Refused(f"{', '.join(where)}: cannot be used: {reason}; is another graph running there?") from None
+
+
+def _config(listen: str | None, connect: str | None, network: Network | None, mode: str | None = None) -> zenoh.Config:
+    """All that Zenoh is ever told."""
+    routed = network is not None and network.routed
+    own = network.listen if network else "tcp/127.0.0.1:0"
+    mode = mode or ("client" if routed else "peer")
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "listen/endpoints": [] if mode == "client" else [listen or own],
         "connect/endpoints": [connect] if connect else [],
+        # A router may be started after those that call it.
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
     }
+    if network is not None:
+        settings["transport/link/tx/lease"] = LEASE_MS
+    if network is not None and network.credentials is not None:
+        settings |= security(network, network.credentials)
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -265,4 +324,7 @@ def _config(listen: str, connect: str | None) -> zenoh.Config:
 
 def _sent_ns(sample: zenoh.Sample) -> int:
     data = sample.attachment.to_bytes() if sample.attachment is not None else b""
-    return struct.unpack("<q", data)[0] if len(data) == 8 else 0
+    if len(data) != _SENT.size:
+        return 0
+    sent_ns, clock = _SENT.unpack(data)
+    return sent_ns if clock == _CLOCK else 0
