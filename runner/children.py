@@ -1,7 +1,11 @@
-"""Child processes: how they are started, die with their parent and say what went wrong."""
+"""Child processes: how they are started, die with their parent and say what went wrong.
+
+As a program, ``children.py PARENT COMMAND...``, it becomes a command that dies with its parent, a process id.
+"""
 
 import contextlib
 import ctypes
+import faulthandler
 import os
 import signal
 import subprocess
@@ -13,6 +17,12 @@ SINGLE_THREADED = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
 """Results must not depend on a thread count, and processes share the cores already."""
+DUMP = signal.SIGUSR2
+"""Makes a child print where it is."""
+PARENT = "RUNNER_PARENT"
+"""Names the variable that tells a child who started it."""
+OOM_SCORE = 500
+"""The kernel that runs out of memory takes a stage before the recorder and the supervisor, which explain it."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -24,7 +34,7 @@ def spawn(module: str, *arguments: str, task: bytes, log: Path) -> subprocess.Po
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
-            env={**os.environ, **SINGLE_THREADED, "PYTHONUNBUFFERED": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
+            env={**os.environ, **SINGLE_THREADED, **_origin(), "PYTHONUNBUFFERED": "1"},
             process_group=0,
         )
     assert child.stdin is not None
@@ -33,9 +43,38 @@ def spawn(module: str, *arguments: str, task: bytes, log: Path) -> subprocess.Po
     return child
 
 
+def _origin() -> dict[str, str]:
+    return {PARENT: str(os.getpid()), "PYTHONPATH": os.pathsep.join(sys.path)}
+
+
 def die_with_parent(signum: signal.Signals = signal.SIGKILL) -> None:
-    """Asks the kernel for a signal to this process when its parent dies."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signum)
+    """Asks the kernel for a signal to this process when its parent dies; it comes at once where that has happened."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signum)
+    if is_orphan():
+        os.kill(os.getpid(), signum)
+
+
+def is_orphan() -> bool:
+    """Whether the process that started this one with :func:`spawn` has died."""
+    return os.getppid() != int(os.environ.get(PARENT, os.getppid()))
+
+
+def explain_death() -> None:
+    """Has a crash in native code, and the supervisor's :data:`DUMP`, print where Python was."""
+    faulthandler.enable()
+    faulthandler.register(DUMP, all_threads=False)
+
+
+def volunteer_for_oom() -> None:
+    """Makes this process the kernel's choice when memory runs out."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
+
+
+def bound(command: list[str]) -> list[str]:
+    """A command that dies with the process that starts it, also where it is no program of ours."""
+    return [sys.executable, __file__, str(os.getpid()), *command]
 
 
 def signal_group(child: subprocess.Popen[bytes], signum: signal.Signals) -> None:
@@ -56,4 +95,19 @@ def last_lines(log: Path, count: int) -> list[str]:
 
 def ending(code: int) -> str:
     """An exit status in words."""
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    if code >= 0:
+        return f"ended with exit code {code}"
+    names = {int(one): one.name for one in signal.Signals}
+    return f"killed by {names.get(-code, f'signal {-code}')}"
+
+
+def main() -> None:
+    """Becomes the command it is given, which then dies with its parent."""
+    _, os.environ[PARENT], *command = sys.argv
+    die_with_parent()
+    del os.environ[PARENT]
+    os.execvp(command[0], command)
+
+
+if __name__ == "__main__":
+    main()

@@ -23,6 +23,7 @@ import rerun_cli
 from mcap.records import Metadata
 
 from runner.canvas import Canvas
+from runner.children import bound
 from runner.codec import CodecError, Envelope, open_envelope, unpack
 from runner.container import Container, Entry, Growing, is_being_written, open_file
 from runner.contract import Refused
@@ -165,7 +166,7 @@ def _start_viewer(port: int, *arguments: str) -> subprocess.Popen[bytes]:
         command += ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", MEMORY]
         source = quote(f"rerun+http://127.0.0.1:{port}/proxy", safe="")
         print(f"viewer: http://127.0.0.1:{web}/?url={source} (Ctrl-C closes it)", flush=True)
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(bound(command), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def _has_display() -> bool:
@@ -213,7 +214,7 @@ def _virtual_display(size: str) -> Generator[str]:
         raise Refused(f"a picture needs a virtual display: apt-get install {PACKAGES}")
     reading, writing = os.pipe()
     command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", f"{size}x24", "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=(writing,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    server = subprocess.Popen(bound(command), pass_fds=(writing,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.close(writing)
     try:
         with os.fdopen(reading) as ready:
