@@ -10,7 +10,7 @@ import yaml
 
 from runner.contract import Refused
 
-OWN_KEYS = ("replicas", "restarts", "heartbeat", "timeout", "startup", "memory")
+OWN_KEYS = ("replicas", "restarts", "heartbeat", "timeout", "startup", "memory", "host")
 """Keys of a stage beside its settings that ``--set`` reaches."""
 Keys = tuple[str, ...]
 """Where a value stands: ("stages", "camera", "config", "dataset")."""
@@ -60,6 +60,8 @@ class Document:
         if not dot:
             return (key,)
         stages = cast("dict[str, Any]", self.values.get("stages") or {})
+        if stage == "hosts" and stage not in stages:
+            return ("hosts", setting)
         if stage not in stages:
             raise Refused(f"--set {key}: no stage {stage!r}{suggest(stage, stages)}")
         if setting in OWN_KEYS:

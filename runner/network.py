@@ -130,6 +130,10 @@ class Layout:
         return f"{scheme}/{host if host.port else f'{host}:0'}"
 
 
+ALONE = Layout()
+"""Of a graph that names no hosts."""
+
+
 def read_layout(document: Document) -> Layout:
     """Reads the hosts of a graph file; raises Refused with the place of what cannot work or is not safe."""
     hosts = tuple(_read_host(document, name, value) for name, value in _entries(document).items())
@@ -138,7 +142,7 @@ def read_layout(document: Document) -> Layout:
         given = next((key for key in ("keys", "router") if document.values.get(key) is not None), None)
         if given is not None:
             raise Refused(f"{document.place(given)}: says nothing without hosts; add: hosts: {{head: ADDRESS:PORT}}")
-        return Layout()
+        return ALONE
     layout = Layout(hosts, keys, _read_router(document, hosts))
     _refuse_open(document, layout)
     if layout.router in (None, layout.head) and not layout.head.port:
@@ -217,14 +221,14 @@ def _refuse_open(document: Document, layout: Layout) -> None:
             )
 
 
-def read_placement(document: Document, layout: Layout, stage: str, value: object) -> tuple[str, ...]:
-    """The host of each replica from ``host: NAME`` or ``host: {NAME: REPLICAS}``; empty where none is named."""
-    place = document.place("stages", stage, "host")
-    counts = {value: 1} if isinstance(value, str) else cast("dict[str, int]", value or {})
+def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:
+    """Replicas by host from ``host: NAME`` or ``host: {NAME: REPLICAS}``; empty where none is named."""
+    counts = {value: 1} if isinstance(value, str) else value or {}
+    names = _entries(document)
     for name in counts:
-        if name not in layout.names:
-            raise Refused(f"{place}: no host {name!r}{suggest(name, layout.names)}")
-    return tuple(name for name, count in counts.items() for _ in range(count))
+        if name not in names:
+            raise Refused(f"{document.place('stages', stage, 'host')}: no host {name!r}{suggest(name, names)}")
+    return counts
 
 
 def choose_host(layout: Layout, name: str | None, file: Path) -> str | None:
