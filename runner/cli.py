@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from runner.commands import Command, graphs, recordings
+from runner.commands import Command, graphs, inspect, recordings, replay
 from runner.contract import Refused
 
 EXIT_REFUSED = 2
@@ -14,6 +14,7 @@ EXIT_REFUSED = 2
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status; what is refused is one line on stderr."""
     options = parser().parse_args(arguments)
+    options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     sys.path.insert(0, os.getcwd())  # noqa: PTH109 - as `python -m` does: stages beside the graph can be named
     command: Command = options.command
     try:
@@ -29,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (graphs, recordings):
+    for group in (graphs, recordings, inspect, replay):
         group.add_commands(commands)
     return parser
 

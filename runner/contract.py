@@ -9,6 +9,8 @@ their annotations:
 * a parameter ``list[M]`` (``M`` a :class:`Part`) is a **gather**: the handler runs once all ``count`` parts
   of a lineage are there, sorted by ``index``;
 * each port belongs to one handler; a join that holds one :class:`Part` runs once for each part of its lineage;
+* a parameter annotated with a :class:`Command` type is a command of the stage, called from outside the graph
+  with ``runner call`` and not wired; it is the only message its handler takes;
 * a handler without message parameters (``on_start``) runs once, when every stage of the graph is ready;
 * every :class:`Message` type in the return annotation is an output port, named in snake case
   (``SceneEstimate`` -> ``scene_estimate``). A handler returns one message, ``None``, or an iterator of messages;
@@ -21,6 +23,7 @@ other stage and substitutes what devices emitted.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
@@ -53,6 +56,17 @@ class Part(Message, frozen=True, kw_only=True):
     count: int
 
 
+class Command(Message, frozen=True, kw_only=True):
+    """What a stage does when somebody outside the graph asks for it: ``runner call STAGE COMMAND field=value``.
+
+    Named like the parameter that takes it. The supervisor publishes it as ``supervisor.STAGE_COMMAND``, so that it
+    is recorded, journalled, replayed and delivered again after a restart like any other message.
+    """
+
+    answer: ClassVar[type[Message] | None] = None
+    """What the stage emits, now or in a later step, when it has done what was asked; None where the step does it."""
+
+
 class Finished(Message, frozen=True, kw_only=True):
     """Ends the graph. ``code`` becomes the exit status (0 success), ``reason`` the last line printed."""
 
@@ -79,6 +93,23 @@ class Spec:
     dtype: str
     shape: tuple[int | str, ...]
     finite: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far a field of a message may be from its recorded value where processor or libraries are others.
+
+    A value holds where it is near enough, or where few enough of an array's elements differ at all.
+    """
+
+    absolute: float = 0.0
+    """In the field's unit; infinite for what only people look at: it is not compared."""
+    share: float = 0.0
+    """Of an array's elements that may differ by any amount, 0 to 1."""
+
+
+Tolerances = Mapping[str, Tolerance]
+"""By ``Type.field`` of the message or struct that declares a field; a graph names its table: ``tolerances:``."""
 
 
 class Refused(Exception):
@@ -111,6 +142,17 @@ class Context(Protocol):
 
     def log(self, text: str, *, level: Level = "info") -> None:
         """Shows one line on the terminal while the graph runs and records it."""
+        ...
+
+
+class Scorer(Protocol):
+    """Says in numbers how well a run went; a graph names its own: ``score: module:Class``.
+
+    Constructed with the settings of every stage, by stage.
+    """
+
+    def score(self, run: Iterable[tuple[str, Message]]) -> Mapping[str, float]:
+        """``run`` has (lineage, message) of every message in order; the names of the numbers contain their units."""
         ...
 
 

@@ -7,16 +7,18 @@ import os
 import pkgutil
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
-from runner.contract import Finished, Message, Part, Refused, Restarted, Stage
+from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.document import Document, Keys, read_document, suggest
+from runner.network import ALONE, Layout, read_layout, read_placement
 from runner.ports import InputPort, StageType, inspect_stage, port_name
 
 T = TypeVar("T")
@@ -56,6 +58,10 @@ class StageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restarts: Annotated[
         Annotated[int, Meta(ge=0)] | None, Meta(description="Crashes of a process before the graph ends")
     ] = None
+    host: Annotated[
+        str | dict[str, Annotated[int, Meta(ge=1)]] | None,
+        Meta(description="Where it runs, or how many replicas run on which host; without it on the first host"),
+    ] = None
     heartbeat: Annotated[
         float, Meta(gt=0, description="Seconds without a sign of life after which a process counts as hung")
     ] = 30.0
@@ -76,6 +82,17 @@ class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stages: dict[str, StageEntry]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
     view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
+    hosts: Annotated[
+        dict[str, str] | None, Meta(description="Machine -> ADDRESS[:PORT]; the first is the head and needs a port")
+    ] = None
+    keys: Annotated[str | None, Meta(description="Folder that `runner keys init` made; turns TLS on")] = None
+    router: Annotated[
+        str | None, Meta(description="Where all processes meet: the head's name, or ADDRESS:PORT of another router")
+    ] = None
+    score: Annotated[str | None, Meta(description="module:Class that says in numbers how well a run went")] = None
+    tolerances: Annotated[
+        str | None, Meta(description="module:NAME of the table of how far fields may be off on another machine")
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +138,8 @@ class Node:
     replicas: int
     restarts: int
     limits: Limits = Limits()
+    placement: tuple[str, ...] = ()
+    """The host of each replica; empty where all are on the head."""
 
     @property
     def replicated(self) -> bool:
@@ -165,6 +184,21 @@ class Graph:
     seed: int
     view: str | None
     nodes: dict[str, Node]
+    score: str | None = None
+    tolerances: str | None = None
+    layout: Layout = ALONE
+
+    def host_of(self, stage: str, replica: int) -> str | None:
+        """The machine of a process; None where the graph names no machines."""
+        if not self.layout.hosts:
+            return None
+        placement = self.nodes[stage].placement
+        return placement[replica] if placement else self.layout.head.name
+
+    def here(self) -> "Graph":
+        """The same graph with every process on the machine that starts it."""
+        nodes = {name: replace(node, placement=()) for name, node in self.nodes.items()}
+        return replace(self, layout=ALONE, nodes=nodes)
 
     def routes(self, stage: str) -> list[Route]:
         """Every edge that leaves a stage."""
@@ -177,11 +211,24 @@ class Graph:
 
     def outputs_of(self, stage: str) -> dict[str, type[Message]]:
         """Output ports of a stage or of the supervisor."""
-        return SUPERVISOR_OUTPUTS if stage == SUPERVISOR else self.nodes[stage].type.outputs
+        return {**SUPERVISOR_OUTPUTS, **self.commands()} if stage == SUPERVISOR else self.nodes[stage].type.outputs
+
+    def commands(self) -> dict[str, type[Command]]:
+        """What the supervisor publishes when a command is called, by output port."""
+        return {
+            command_port(node.name, name): kind
+            for node in self.nodes.values()
+            for name, kind in node.type.commands.items()
+        }
 
     def processes(self) -> list[tuple[str, int]]:
         """(stage, replica) of every process."""
         return [(node.name, replica) for node in self.nodes.values() for replica in range(node.replicas)]
+
+
+def command_port(stage: str, command: str) -> str:
+    """The supervisor's output port from which a stage gets a command."""
+    return f"{stage}_{command}"
 
 
 # ---------------------------------------------------------------------------------------------- loading
@@ -198,7 +245,8 @@ def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
 def graph_to_json(graph: Graph) -> str:
     """The graph as it runs, every setting written out: what processes are given and recordings keep."""
     stages = {node.name: node_entry(node) for node in graph.nodes.values()}
-    return json.dumps({"name": graph.name, "seed": graph.seed, "view": graph.view, "stages": stages}, indent=1)
+    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "score", "tolerances")}
+    return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
 
 
 def node_entry(node: Node) -> dict[str, Any]:
@@ -209,8 +257,10 @@ def node_entry(node: Node) -> dict[str, Any]:
         "inputs": {
             port: {"from": f"{edge.stage}.{edge.port}", "policy": edge.policy, "queue": edge.queue}
             for port, edge in node.inputs.items()
+            if port not in node.type.commands
         },
         "replicas": node.replicas,
+        **({"host": dict(Counter(node.placement))} if node.placement else {}),
         "restarts": node.restarts,
         "heartbeat": node.limits.heartbeat,
         "timeout": node.limits.timeout,
@@ -221,14 +271,22 @@ def node_entry(node: Node) -> dict[str, Any]:
 
 def node_from_entry(name: str, entry: dict[str, Any]) -> Node:
     """Reads back what :func:`node_entry` wrote, without the rest of the graph and so without importing it."""
-    document = Document(name, Path.cwd(), {"stages": {name: entry}})
+    document = Document(name, Path.cwd(), {"stages": {name: _unplaced(entry)}})
     read = _read_entry(document, name)
     return _node(document, name, read, _load(document, name, read))
 
 
 def graph_from_json(text: str, label: str = "graph") -> Graph:
-    """Reads back what :func:`graph_to_json` wrote; ``label`` names it in errors."""
-    return _build(Document(label, Path.cwd(), json.loads(text)))
+    """Reads back what :func:`graph_to_json` wrote, for this machine alone; ``label`` names it in errors."""
+    values = {key: value for key, value in json.loads(text).items() if key not in ("hosts", "keys", "router")}
+    if isinstance(values.get("stages"), dict):
+        values["stages"] = {name: _unplaced(entry) for name, entry in values["stages"].items()}
+    return _build(Document(label, Path.cwd(), values))
+
+
+def _unplaced(entry: Any) -> Any:
+    """A stage's entry without its host: what is read back runs where it is read."""
+    return {key: value for key, value in entry.items() if key != "host"} if isinstance(entry, dict) else entry
 
 
 def _build(document: Document) -> Graph:
@@ -242,7 +300,8 @@ def _build(document: Document) -> Graph:
     types = dict(_collect(lambda name: (name, _load(document, name, entries[name])), names))
     _resolve_settings(document, entries, types)
     nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
-    checked = Graph(graph.name, graph.seed, graph.view, nodes)
+    layout = read_layout(document)
+    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout)
     _collect(
         lambda keys: _check_edge(document, checked, *keys),
         [(node, port) for node in names for port in nodes[node].inputs],
@@ -437,9 +496,10 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
     if entry.config and kind.config is None:
         raise Refused(f"{document.place(*keys, 'config')}: {entry.stage} has no settings")
     config = _read(kind.config, entry.config, document, (*keys, "config")) if kind.config else None
-    replicas = len(os.sched_getaffinity(0)) if entry.replicas == "auto" else entry.replicas
+    placement = _placement(document, name, entry)
+    replicas = len(os.sched_getaffinity(0)) if entry.replicas == "auto" else max(entry.replicas, len(placement))
     parts = [port.name for port in kind.inputs.values() if issubclass(port.type, Part) and port.kind == "one"]
-    if entry.replicas != 1 and not parts:
+    if (entry.replicas != 1 or replicas != 1) and not parts:
         raise Refused(f"{document.place(*keys, 'replicas')}: {entry.stage} takes no Part, which is what replicas share")
     restarts = entry.restarts if entry.restarts is not None else 0 if kind.cls.device else RESTARTS
     if kind.cls.stateful and replicas > 1:
@@ -447,7 +507,23 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
         raise Refused(f"{place}: {entry.stage} is stateful: replicas would remember different things; valid: 1")
     edges = _edges(document, name, entry, kind)
     limits = Limits(heartbeat=entry.heartbeat, timeout=entry.timeout, startup=entry.startup, memory=entry.memory)
-    return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits)
+    return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits, placement)
+
+
+def _placement(document: Document, name: str, entry: StageEntry) -> tuple[str, ...]:
+    """The host of each replica, which a count by host or ``replicas`` says, and where both do they agree."""
+    counts = read_placement(document, name, entry.host)
+    stated = "replicas" in document.values["stages"][name]
+    if counts and stated and entry.replicas == "auto":
+        place = document.place("stages", name, "replicas")
+        raise Refused(f"{place}: the cores of {next(iter(counts))} are not known here; valid: a number")
+    if isinstance(entry.host, str):
+        return (entry.host,) * cast("int", entry.replicas)
+    placement = tuple(host for host, count in counts.items() for _ in range(count))
+    if placement and stated and entry.replicas != len(placement):
+        place = document.place("stages", name, "replicas")
+        raise Refused(f"{place}: {entry.replicas}, but host places {len(placement)}; valid: either of them alone")
+    return placement
 
 
 # ---------------------------------------------------------------------------------------------- edges
@@ -455,16 +531,19 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
 
 def _edges(document: Document, name: str, entry: StageEntry, kind: StageType) -> dict[str, Edge]:
     keys = ("stages", name, "inputs")
+    wired = [port for port in kind.inputs if port not in kind.commands]
     for port in entry.inputs:
         if port not in kind.inputs:
-            raise Refused(
-                f"{document.place(*keys, port)}: {entry.stage} has no input {port!r}{suggest(port, kind.inputs)}"
-            )
-    missing = [port for port in kind.inputs if port not in entry.inputs]
+            raise Refused(f"{document.place(*keys, port)}: {entry.stage} has no input {port!r}{suggest(port, wired)}")
+        if port in kind.commands:
+            raise Refused(f"{document.place(*keys, port)}: a command is not connected: runner call {name} {port}")
+    missing = [port for port in wired if port not in entry.inputs]
     if missing:
         wanted = ", ".join(f"{port} ({kind.inputs[port].type.__name__})" for port in missing)
         raise Refused(f"{document.place(*keys)}: not connected: {wanted}")
-    return {port: _edge(cast("EdgeEntry", edge)) for port, edge in entry.inputs.items()}
+    edges = {port: _edge(cast("EdgeEntry", edge)) for port, edge in entry.inputs.items()}
+    commands = {port: Edge(SUPERVISOR, command_port(name, port), "block", QUEUE) for port in kind.commands}
+    return {**edges, **commands}
 
 
 def _edge(entry: EdgeEntry) -> Edge:

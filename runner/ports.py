@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from runner.contract import Context, Message, Part, Refused, Stage
+from runner.contract import Command, Context, Message, Part, Refused, Stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +26,11 @@ class Handler:
     inputs: tuple[InputPort, ...]
     context: str | None
     """Name of the parameter that receives the step's context."""
+
+    @property
+    def is_command(self) -> bool:
+        """True for what is called from outside the graph."""
+        return any(issubclass(port.type, Command) for port in self.inputs)
 
     @property
     def driver(self) -> InputPort | None:
@@ -54,6 +59,11 @@ class StageType:
     def inputs(self) -> dict[str, InputPort]:
         """All input ports by name."""
         return {port.name: port for handler in self.handlers for port in handler.inputs}
+
+    @property
+    def commands(self) -> dict[str, type[Command]]:
+        """The input ports that ``runner call`` reaches, by name."""
+        return {port.name: port.type for port in self.inputs.values() if issubclass(port.type, Command)}
 
     def handler_of(self, port: str) -> Handler:
         """The handler that takes what arrives on a port."""
@@ -96,6 +106,7 @@ def _handler(cls: type[Stage], name: str) -> Handler:
     if name == "source" and inputs:
         raise Refused(f"{cls.__name__}.source({inputs[0].name}): a source takes no messages")
     _refuse_two_drivers(cls, name, inputs)
+    _refuse_joined_command(cls, name, inputs)
     return Handler(name, tuple(inputs), context)
 
 
@@ -134,6 +145,13 @@ def _refuse_two_drivers(cls: type[Stage], method: str, inputs: list[InputPort]) 
     if len(parts) > 1 or (parts and gathers):
         names = ", ".join(parts + gathers)
         raise Refused(f"{cls.__name__}.{method}({names}): a handler takes at most one Part, or gathers lists of them")
+
+
+def _refuse_joined_command(cls: type[Stage], method: str, inputs: list[InputPort]) -> None:
+    """Nothing else hangs on a command: a join with one would wait for ever."""
+    for port in inputs:
+        if issubclass(port.type, Command) and len(inputs) > 1:
+            raise Refused(f"{cls.__name__}.{method}({port.name}): a command is the only message its handler takes")
 
 
 def _refuse_shared_ports(cls: type[Stage], handlers: tuple[Handler, ...]) -> None:

@@ -6,348 +6,180 @@ lived, runs in a fresh process of its own.
 
 from __future__ import annotations
 
-import itertools
 import json
-import sys
+import os
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from runner.children import die_with_parent, ending, last_lines, spawn
-from runner.codec import CodecError, Envelope, Step, decode, pack
-from runner.compare import differences
-from runner.contract import Message, Refused
+from runner.contract import Refused, Tolerances
 from runner.document import Document
-from runner.graph import Graph, Node, graph_from_json, node_entry, node_from_entry
+from runner.graph import Graph, Node, graph_from_json
 from runner.info import seconds, table
-from runner.ports import Handler
-from runner.provenance import machine, package_versions, revision
-from runner.recording import Recording, replicated, split_id, topic_of
-from runner.step import Arrival, Executor, receive, step_time
+from runner.recording import Recording, replicated
+from runner.summary import Summary
+from runner.tasks import Comparison, Reenactment, Result, Task, steps_of
+from runner.tolerances import Origin, load_tolerances
+from runner.workshop import Job, run_each
 
-WORKERS = 2
-"""Processes that replay at the same time."""
-HEADER = tuple(name for name in Envelope.__struct_fields__ if name != "body")
 Say = Callable[[str], None]
 
 
-class Divergence(msgspec.Struct, frozen=True):
-    """A difference between the recording and the replay."""
-
-    position: int
-    """Of the message in the recording: the lowest comes first."""
-    stage: str
-    replica: int
-    incarnation: int
-    step: int
-    message: str
-    """Id, or what was expected in its place."""
-    difference: str
-
-    def __str__(self) -> str:
-        process = f"{self.stage}[{self.replica}]" + (f" after restart {self.incarnation}" if self.incarnation else "")
-        return f"stage {process}, step {self.step}, message {self.message}: {self.difference}"
-
-
-class Task(msgspec.Struct, frozen=True):
-    """What one process executes again: one incarnation of a stage, or a share of a replicated stage's steps."""
-
-    path: str
-    stage: str
-    entry: dict[str, Any]
-    """The stage's part of the graph, with the settings of this replay applied."""
-    seed: int
-    incarnation: int
-    share: int = 0
-    shares: int = 1
-
-
-class Result(msgspec.Struct, frozen=True):
-    """How a task ended."""
-
-    stage: str
-    steps: int = 0
-    messages: int = 0
-    seconds: float = 0.0
-    """Time inside handlers."""
-    diverged: int = 0
-    first: Divergence | None = None
-    failure: str = ""
-    """Why the stage could not be executed at all."""
-
-
-def replay(
-    path: Path, *, verify: bool, assignments: Sequence[str] = (), workers: int = WORKERS, say: Say = print
-) -> int:
-    """Replays a recording and returns the exit status: 0 where every message is identical.
-
-    Without ``verify`` only says what a replay would execute. ``assignments`` change settings, for example
-    the place of a file that has moved. Raises Refused where the file is no recording.
-    """
+def read(path: Path, assignments: Sequence[str] = ()) -> tuple[Recording, Graph]:
+    """A recording and its graph, changed by ``--set`` assignments; raises Refused where either is not readable."""
     recording = Recording(path)
-    graph = graph_from_json(_with_settings(recording, assignments), str(path))
-    say(f"{path}: {recording.verdict}")
-    if not verify:
-        _say_plan(recording, graph, say)
-        return 0
-    _say_changes(recording, say)
-    results = _run_all(_tasks(recording, graph, workers), workers, say)
-    return _conclude(recording, graph, results, say)
+    return recording, graph_from_json(changed_graph(recording, assignments), str(path))
 
 
-def _with_settings(recording: Recording, assignments: Sequence[str]) -> str:
-    document = Document(str(recording.path), Path.cwd(), recording.graph)
+def changed_graph(recording: Recording, assignments: Sequence[str]) -> str:
+    """JSON of the recorded graph with ``--set`` assignments applied."""
+    document = Document(str(recording.path), Path.cwd(), json.loads(json.dumps(recording.graph)))
     for assignment in assignments:
         document.set(assignment)
     return json.dumps(document.values)
 
 
-# ------------------------------------------------------------------------------------ planning
+def plan(path: Path, say: Say) -> int:
+    """Says what a replay would execute."""
+    recording, graph = read(path)
+    say(f"{path}: {recording.verdict}")
+    for line in _plan(recording, graph):
+        say(line)
+    return 0
 
 
-def _executed(graph: Graph) -> list[Node]:
-    return [node for node in graph.nodes.values() if not node.type.cls.device]
-
-
-def _tasks(recording: Recording, graph: Graph, workers: int) -> list[Task]:
-    """Longest first, so that the workers end together."""
-    cost: dict[tuple[str, int], int] = defaultdict(int)
-    shared = replicated(recording.graph)
-    names = {node.name for node in _executed(graph)}
-    for step in recording.steps:
-        if step.stage in names:
-            cost[step.stage, 0 if step.stage in shared else step.incarnation] += step.computed_ns
-    tasks: list[Task] = []
-    for stage, incarnation in sorted(cost, key=lambda key: -cost[key]):
-        shares = workers if stage in shared else 1
-        entry = node_entry(graph.nodes[stage])
-        tasks += [Task(str(recording.path), stage, entry, graph.seed, incarnation, i, shares) for i in range(shares)]
-    return tasks
-
-
-def _say_plan(recording: Recording, graph: Graph, say: Say) -> None:
-    executed = {node.name for node in _executed(graph)}
+def _plan(recording: Recording, graph: Graph) -> list[str]:
+    names = {node.name for node in executed(graph)}
     rows: list[tuple[str, ...]] = []
     for name in graph.nodes:
         steps = [step for step in recording.steps if step.stage == name]
-        plan = "executed again" if name in executed else "device: its messages are taken from the recording"
-        rows.append((name, plan, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
-    for line in table(("stage", "in a replay", "steps", "computed"), rows):
+        fate = "executed again" if name in names else "device: its messages are taken from the recording"
+        rows.append((name, fate, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
+    return table(("stage", "in a replay", "steps", "computed"), rows)
+
+
+def executed(graph: Graph) -> list[Node]:
+    """The stages that a replay executes: all that are no device."""
+    return [node for node in graph.nodes.values() if not node.type.cls.device]
+
+
+def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: Say) -> int:
+    """Executes everything again in ``workers`` processes at a time (None: one a core) and compares every byte.
+
+    Returns 0 where every message is identical, or where this machine is another and every message within the
+    graph's tolerances; else 1. Raises Refused where the file is no recording.
+    """
+    began = time.perf_counter()
+    recording, graph = read(path, assignments)
+    origin = Origin(recording)
+    for line in origin.lines():
         say(line)
+    say(f"{path}: {recording.verdict}")
+    verification = _Verification(recording, graph, {} if origin.same else load_tolerances(graph), say)
+    return verification.conclude(verification.run(workers or len(os.sched_getaffinity(0))), began)
 
 
-def _say_changes(recording: Recording, say: Say) -> None:
-    """Names what may explain a difference: other source, other packages, another machine."""
-    then = recording.aspect("packages", dict[str, str]())
-    now = package_versions()
-    changed = [f"{name} {then[name]} -> {now.get(name, 'absent')}" for name in then if now.get(name) != then[name]]
-    before = recording.aspect("machine", dict[str, str]())
-    changed += [
-        f"{key} {before[key]} -> {value}" for key, value in machine().items() if before.get(key, value) != value
-    ]
-    source = recording.run.get("revision", "")
-    changed += [f"source {source or 'unknown'} -> {revision()}"] if source != revision() else []
-    if changed:
-        say(f"changed since the recording: {'; '.join(changed)}")
+class _Verification:
+    """One replay of everything."""
 
+    def __init__(self, recording: Recording, graph: Graph, tolerances: Tolerances, say: Say) -> None:
+        self._recording = recording
+        self._graph = graph
+        self._tolerances = tolerances
+        self._say = say
 
-# ------------------------------------------------------------------------------------ running
+    def run(self, workers: int) -> list[Result]:
+        """Executes every task and says how each ended."""
+        results: list[Result] = []
+        tasks = tasks_of(self._recording, executed(self._graph), workers)
+        with tempfile.TemporaryDirectory() as folder:
+            jobs = [Job(task, lambda task=task: self._work(task, Path(folder))) for task in tasks]
+            for task, answer in run_each(jobs, workers=workers, folder=Path(folder)):
+                failed = isinstance(answer, str)
+                result = Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
+                self._say(f"{task}: {result}")
+                results.append(result)
+        return results
 
-
-def _run_all(tasks: Sequence[Task], workers: int, say: Say) -> list[Result]:
-    def run(task: Task) -> Result:
-        result = _run_in_process(task)
-        share = f" ({task.share + 1} of {task.shares})" if task.shares > 1 else ""
-        restart = f" after restart {task.incarnation}" if task.incarnation else ""
-        say(f"{result.stage}{restart}{share}: {_outcome(result)}")
-        return result
-
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(run, tasks))
-
-
-def _run_in_process(task: Task) -> Result:
-    with tempfile.TemporaryDirectory() as folder:
-        answer, log = Path(folder) / "result", Path(folder) / "log"
-        child = spawn("runner.replay", task=msgspec.json.encode((task, str(answer))), log=log)
+    def _work(self, task: Task, folder: Path) -> bytes:
+        """Executes one task; runs in the task's own process."""
         try:
-            code = child.wait()
-        finally:
-            child.kill()
-        if not answer.exists():
-            return Result(task.stage, failure=": ".join([f"its process {ending(code)}", *last_lines(log, 1)]))
-        return msgspec.json.decode(answer.read_bytes(), type=Result)
+            return msgspec.json.encode(self._result(task, folder))
+        except Refused as refusal:
+            return msgspec.json.encode(Result(failure=str(refusal)))
 
+    def _result(self, task: Task, folder: Path) -> Result:
+        node, began = self._graph.nodes[task.stage], time.perf_counter()
+        steps = steps_of(self._recording, task, node)
+        again = Reenactment(self._recording, node, steps, seed=self._graph.seed, directory=_files(folder))
+        startup = time.perf_counter() - began
+        comparison = Comparison(self._recording, node, self._tolerances)
+        for step in steps:
+            comparison.add(again.execute(step))
+        again.stage.close()
+        return comparison.result(again.seconds, startup)
 
-def _outcome(result: Result) -> str:
-    if result.failure:
-        return f"could not be executed: {result.failure}"
-    counts = f"{result.steps} steps, {result.messages} messages, {result.seconds:.2f} s"
-    return f"{counts}, {f'{result.diverged} DIVERGED' if result.diverged else 'identical'}"
-
-
-def _conclude(recording: Recording, graph: Graph, results: Sequence[Result], say: Say) -> int:
-    found = sorted((result.first for result in results if result.first), key=lambda found: found.position)
-    if found:
-        say(f"DIVERGED first at {found[0]}")
-    compared = sum(result.messages for result in results)
-    expected = _emitted_by([node.name for node in _executed(graph)], recording)
-    bad = bool(found) or any(result.failure for result in results) or not recording.verdict.complete
-    if not bad:
-        say(f"IDENTICAL: {compared} messages of {len(_executed(graph))} stages")
-    elif not found:
-        say(f"NOT VERIFIED: {compared} of {expected} messages compared, none differs; {recording.verdict}")
-    return int(bad)
-
-
-def _emitted_by(stages: Sequence[str], recording: Recording) -> int:
-    return sum(message.topic.partition("/")[0] in stages for message in recording.messages.values())
-
-
-# ------------------------------------------------------------------------------------ one task
-
-
-class Replayer:
-    """Executes the steps of one task and compares what they emit."""
-
-    def __init__(self, task: Task, directory: Path) -> None:
-        """Constructs the stage; raises Refused where that fails."""
-        self._recording = Recording(Path(task.path))
-        self._node = node_from_entry(task.stage, task.entry)
-        self._steps = _steps_of(self._recording, task)
-        self._positions = {id: position for position, id in enumerate(self._recording.messages)}
-        self._stage = self._node.construct()
-        numbers = _first_numbers(self._steps)
-        self._executor = Executor(
-            self._node, self._stage, seed=task.seed, directory=directory, log=lambda *_: None, numbers=numbers
+    def conclude(self, results: Sequence[Result], began: float) -> int:
+        """The verdict, what differs by field, and the exit status."""
+        wall = time.perf_counter() - began
+        for line in Summary(change for result in results for change in result.changes).lines():
+            self._say(line)
+        self._say(
+            f"replayed in {wall:.1f} s: handlers took {sum(result.seconds for result in results):.1f} s, "
+            f"when recorded {sum(self._computed()) * 1e-9:.1f} s; "
+            f"constructing the stages {sum(result.startup for result in results):.1f} s"
         )
-        self._seconds = 0.0
-        self._messages = 0
+        return self._verdict(results)
 
-    def run(self) -> Result:
-        """Executes every step, in the order of the journal."""
-        found = [divergence for step in self._steps for divergence in self._differences(step)]
-        self._stage.close()
-        first = min(found, key=lambda divergence: divergence.position, default=None)
-        name = self._node.name
-        return Result(name, len(self._steps), self._messages, self._seconds, len(found), first)
+    def _verdict(self, results: Sequence[Result]) -> int:
+        names = [node.name for node in executed(self._graph)]
+        compared, within = sum(result.messages for result in results), sum(result.within for result in results)
+        found = sorted((result.first for result in results if result.first), key=lambda found: found.position)
+        verdict = self._recording.verdict
+        if found:
+            self._say(f"DIVERGED first at {found[0]}")
+            return 1
+        if any(result.failure for result in results) or not verdict.complete:
+            expected = emitted_by(names, self._recording)
+            none = "none differs" if not within else f"{within} within tolerances, none beyond"
+            self._say(f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {verdict}")
+            return 1
+        if within:
+            counts = f"{within} of {compared} messages of {len(names)} stages differ"
+            self._say(f"WITHIN TOLERANCES: {counts}, no field by more than {self._graph.tolerances} allows")
+        else:
+            self._say(f"IDENTICAL: {compared} messages of {len(names)} stages")
+        return 0
 
-    def _differences(self, step: Step) -> Iterator[Divergence]:
-        """One per message that differs."""
-        handler = next((handler for handler in self._node.type.handlers if handler.name == step.handler), None)
-        if handler is None:
-            yield self._divergence(step, step.handler, "the stage has no such handler any more")
-            return
-        try:
-            arrivals = self._arrivals(step)
-        except (CodecError, KeyError) as error:
-            yield self._divergence(step, step.emitted[0] if step.emitted else "-", _input_error(error))
-            return
-        replayed, error = self._execute(step, handler, arrivals)
-        yield from self._compared(step, replayed)
-        if step.outcome != "stopped" and not (step.error.startswith(error) if error else not step.error):
-            text = f"recorded {step.error or 'no error'!r}, replayed {error or 'no error'!r}"
-            yield self._divergence(step, "-", f"error: {text}")
-
-    def _arrivals(self, step: Step) -> list[Arrival]:
-        ports = self._node.type.inputs
-        arrivals: list[Arrival] = []
-        for port, id in step.consumed:
-            try:
-                arrivals.append(receive(ports[port], self._recording.envelope(id)))
-            except CodecError as error:
-                raise CodecError(f"input {id}: {error.type}", error.field, error.reason) from None
-        return arrivals
-
-    def _execute(self, step: Step, handler: Handler, arrivals: list[Arrival]) -> tuple[list[Envelope], str]:
-        time_ns = step_time(self._node, arrivals, step.time_ns)
-        wanted = len(step.emitted) if step.outcome == "stopped" else None
-        replayed: list[Envelope] = []
-        began = time.perf_counter()
-        try:
-            for sealed in itertools.islice(self._executor.run(handler, arrivals, time_ns), wanted):
-                replayed.append(sealed)
-        except Exception as error:
-            return replayed, f"{type(error).__name__}: {error}"
-        finally:
-            self._seconds += time.perf_counter() - began
-        return replayed, ""
-
-    def _compared(self, step: Step, replayed: list[Envelope]) -> Iterator[Divergence]:
-        for id, sealed in itertools.zip_longest(step.emitted, replayed):
-            if id is None:
-                yield self._divergence(step, sealed.id, "emitted in the replay only")
-            elif sealed is None:
-                yield self._divergence(step, id, "recorded, and not emitted in the replay")
-            elif id in self._recording.messages:
-                self._messages += 1
-                text = _difference(self._kind(id), self._recording.envelope(id), sealed)
-                if text:
-                    yield self._divergence(step, id, text)
-
-    def _kind(self, id: str) -> type[Message] | None:
-        return self._node.type.outputs.get(topic_of(id).partition("/")[2])
-
-    def _divergence(self, step: Step, message: str, difference: str) -> Divergence:
-        position = self._positions.get(message, len(self._positions))
-        return Divergence(position, step.stage, step.replica, step.incarnation, step.number, message, difference)
+    def _computed(self) -> Iterator[int]:
+        names = {node.name for node in executed(self._graph)}
+        return (step.computed_ns for step in self._recording.steps if step.stage in names)
 
 
-def _steps_of(recording: Recording, task: Task) -> list[Step]:
-    steps = [step for step in recording.steps if step.stage == task.stage]
-    if task.stage in replicated(recording.graph):
-        return steps[task.share :: task.shares]
-    return sorted((step for step in steps if step.incarnation == task.incarnation), key=lambda step: step.number)
+def _files(folder: Path) -> Path:
+    """An empty folder for what a stage writes."""
+    return Path(tempfile.mkdtemp(dir=folder))
 
 
-def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:
-    """Where the sequence of each port went on in this incarnation."""
-    numbers: dict[str, int] = {}
-    for id in (id for step in steps for id in step.emitted):
-        numbers.setdefault(topic_of(id).partition("/")[2], split_id(id)[1])
-    return numbers
+def tasks_of(recording: Recording, nodes: Iterable[Node], workers: int) -> list[Task]:
+    """Every task of a replay, longest first, so that the workers end together."""
+    cost: dict[tuple[str, int], int] = defaultdict(int)
+    shared, kinds = replicated(recording.graph), {node.name: node.type.cls for node in nodes}
+    for step in recording.steps:
+        if step.stage in kinds:
+            together = step.stage in shared or kinds[step.stage].stateful
+            cost[step.stage, 0 if together else step.incarnation] += step.computed_ns
+    tasks: list[Task] = []
+    for stage, incarnation in sorted(cost, key=lambda key: -cost[key]):
+        shares = workers if stage in shared else 1
+        tasks += [Task(stage, incarnation, share, shares) for share in range(shares)]
+    return tasks
 
 
-def _input_error(error: CodecError | KeyError) -> str:
-    if isinstance(error, CodecError):
-        return f"it cannot be executed: {error}"
-    return f"it cannot be executed: {error.args[0]} is not recorded"
-
-
-def _difference(kind: type[Message] | None, recorded: Envelope, replayed: Envelope) -> str:
-    """Where two messages differ, or nothing where every byte is the same."""
-    if pack(recorded) == pack(replayed):
-        return ""
-    headers = (differences(getattr(recorded, name), getattr(replayed, name), name) for name in HEADER)
-    found = next(itertools.chain.from_iterable(headers), None)
-    if found is None and kind is not None:
-        try:
-            found = next(differences(decode(kind, recorded.body), decode(kind, replayed.body)), None)
-        except CodecError as error:
-            return f"the recorded message cannot be read: {error}"
-    return str(found or "the same values in other bytes")
-
-
-def _work(task: Task) -> Result:
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            return Replayer(task, Path(folder)).run()
-        except Refused as error:
-            return Result(task.stage, failure=str(error))
-
-
-def main() -> None:
-    """Executes the task on stdin and writes its result to the file named there too."""
-    die_with_parent()
-    task, answer = msgspec.json.decode(sys.stdin.buffer.read(), type=tuple[Task, str])
-    Path(answer).write_bytes(msgspec.json.encode(_work(task)))
-
-
-if __name__ == "__main__":
-    main()
+def emitted_by(stages: Sequence[str], recording: Recording) -> int:
+    """How many recorded messages these stages emitted."""
+    return sum(message.topic.partition("/")[0] in stages for message in recording.messages.values())

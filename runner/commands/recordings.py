@@ -1,24 +1,16 @@
-"""Commands on recordings: ``info``, ``replay``, ``view``."""
+"""Commands on recordings: ``info``, ``view``."""
 
 import argparse
 from pathlib import Path
 
-from runner.commands import Commands, add, add_file, add_settings
+from runner.commands import Commands, add, add_file
 from runner.contract import Refused
 
 
 def add_commands(commands: Commands) -> None:
     """Adds the commands of this group."""
     add_file(add(commands, "info", _info, "say what a recording holds and whether it is complete"))
-    _add_replay(commands)
     _add_view(commands)
-
-
-def _add_replay(commands: Commands) -> None:
-    replay = add(commands, "replay", _replay, "execute the stages of a recording again from what they consumed")
-    add_file(replay)
-    replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
-    add_settings(replay)
 
 
 def _add_view(commands: Commands) -> None:
@@ -34,12 +26,6 @@ def _info(options: argparse.Namespace) -> int:
 
     print(describe(options.file))
     return 0
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from runner.replay import replay
-
-    return replay(options.file, verify=options.verify, assignments=options.settings)
 
 
 def _view(options: argparse.Namespace) -> int:

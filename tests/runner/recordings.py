@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -12,7 +12,7 @@ from runner.codec import Envelope, Step, pack
 from runner.graph import Graph, Node, graph_to_json, load_graph
 from runner.inbox import Inbox, Ready
 from runner.recorder import Manifest, RecordingWriter, topic
-from runner.recording import Verdict
+from runner.recording import RUN, Verdict
 from runner.step import Executor, receive, step_time
 
 TOYS = Path(__file__).with_name("toys.yaml")
@@ -78,13 +78,17 @@ def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
                 yield from step(node, ready)
 
 
-def rewrite(source: Path, target: Path, change: Callable[[str, bytes], bytes]) -> Path:
-    """Copies a recording; ``change`` gets each topic and payload and returns what is kept in its place."""
+def rewrite(
+    source: Path, target: Path, change: Callable[[str, bytes], bytes], aspects: Mapping[str, str] | None = None
+) -> Path:
+    """Copies a recording; ``change`` gets each topic and payload and returns what is kept in its place, ``aspects``
+    replace what its metadata says of the run."""
     with source.open("rb") as file, target.open("wb") as output:
         reader, writer = make_reader(file), Writer(output)
         writer.start()
         for metadata in reader.iter_metadata():
-            writer.add_metadata(metadata.name, metadata.metadata)
+            changed = aspects or {} if metadata.name == RUN else {}
+            writer.add_metadata(metadata.name, {**metadata.metadata, **changed})
         channels: dict[str, int] = {}
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if channel.topic not in channels:

@@ -10,8 +10,10 @@ import yaml
 from runner.cli import main
 from runner.contract import Refused
 from runner.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
+from tests.runner.toys import Add, Collect
 
-TOYS = Path(__file__).parent / "toys.yaml"
+HERE = Path(__file__).parent
+TOYS = HERE / "toys.yaml"
 ROOT = Path(__file__).parents[2]
 OUT = "sink.path=out.txt"
 
@@ -127,6 +129,19 @@ def test_settings_fill_each_other_in(tmp_path: Path):
 def test_json_is_read_back_as_the_same_graph(tmp_path: Path):
     text = graph_to_json(load(tmp_path, OUT))
     assert graph_to_json(graph_from_json(text)) == text
+
+
+def test_commands_are_not_wired(tmp_path: Path):
+    path = HERE / "account.yaml"
+    graph = load_graph(path)
+    assert graph.commands() == {"account_add": Add, "account_collect": Collect}
+    assert [route.output for route in graph.routes("supervisor")] == ["account_add", "account_collect"]
+    assert graph_from_json(graph_to_json(graph)) == graph
+    assert 'supervisor -->|"Add"| account' in mermaid(graph)
+    wired = tmp_path / "wired.yaml"
+    wired.write_text(path.read_text().replace("{number: ", "{add: counter.number, number: "))
+    with pytest.raises(Refused, match=r"wired.yaml:8: stages.account.inputs.add: a command is not connected: runner"):
+        load_graph(wired)
 
 
 def test_mermaid_shows_stages_and_types(tmp_path: Path):

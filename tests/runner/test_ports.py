@@ -6,7 +6,7 @@ import pytest
 
 from runner.contract import Context, Refused, Stage
 from runner.ports import inspect_stage, port_name
-from tests.runner.toys import Answer, Double, Gatherer, Number, Piece, Total, Worker
+from tests.runner.toys import Account, Add, Answer, Collect, Double, Gatherer, Number, Piece, Total, Worker
 
 
 def test_a_join_with_a_gather_is_read():
@@ -39,6 +39,16 @@ def test_port_names_are_snake_case():
     assert port_name(Number) == "number"
     assert port_name(type("SceneEstimate", (Number,), {})) == "scene_estimate"
     assert port_name(type("RGBFrame", (Number,), {})) == "rgb_frame"
+
+
+def test_commands_are_inputs_that_are_called():
+    kind = inspect_stage(Account)
+    assert kind.commands == {"add": Add, "collect": Collect}
+    assert [handler.is_command for handler in kind.handlers] == [True, True, False]
+
+
+class CommandJoined(Stage):
+    def on_add(self, add: Add, number: Number) -> None: ...
 
 
 class NoAnnotation(Stage):
@@ -89,6 +99,7 @@ class MutableConfig(Stage):
         (NoResult, r"NoResult.on_number\(return\): has no annotation"),
         (WrongType, r"WrongType.on_number\(number\): .* is not a Message"),
         (ListOfWhole, r"ListOfWhole.on_numbers\(numbers\): a list gathers Parts, and Number is not one"),
+        (CommandJoined, r"CommandJoined.on_add\(add\): a command is the only message its handler takes"),
         (TwoParts, r"TwoParts.on_parts\(piece, answer\): a handler takes at most one Part"),
         (SharedPort, r"SharedPort.on_second\(number\): on_first takes the port of that name too"),
         (NotADevice, "NotADevice.source: only a stage marked `device = True`"),

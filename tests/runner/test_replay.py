@@ -1,15 +1,19 @@
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from runner.codec import Envelope, Step, pack, unpack
-from runner.contract import Refused
+from runner.codec import Envelope, Step, decode, envelope, pack, unpack
 from runner.recording import Recording
-from runner.replay import replay
 from tests.runner.recordings import record_toys, rewrite
+from tests.runner.toys import Answer
+
+TABLE = "tolerances=tests.runner.toys:TOLERANCES"
+HEADER = {"id": "a.b#0", "lineage": "a.b#0", "time_ns": 0, "causes": ()}
 
 
 @pytest.fixture(scope="module")
@@ -17,10 +21,16 @@ def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_toys(tmp_path_factory.mktemp("toys"))[0]
 
 
-def verify(path: Path, *assignments: str) -> tuple[int, str]:
-    lines: list[str] = []
-    code = replay(path, verify=True, assignments=assignments, say=lines.append)
-    return code, "\n".join(lines)
+def replay(path: Path, *arguments: str) -> tuple[int, str]:
+    """``runner replay`` as a user types it: its exit status, and all that it says."""
+    command = (sys.executable, "-m", "runner.cli", "replay", str(path), *arguments)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    return done.returncode, done.stdout + done.stderr
+
+
+def verify(path: Path, *assignments: str, workers: int = 2) -> tuple[int, str]:
+    settings = [part for assignment in assignments for part in ("--set", assignment)]
+    return replay(path, "--verify", "--workers", str(workers), *settings)
 
 
 def changed(toys: Path, tmp_path: Path, id: str, change: Callable[[Envelope], Envelope | bytes]) -> Path:
@@ -134,24 +144,107 @@ def test_each_incarnation_is_a_fresh_instance_that_goes_on_counting(tmp_path: Pa
     assert "gatherer after restart 1: 3 steps, 3 messages" in said
 
 
-def test_a_stage_that_cannot_be_constructed_is_one_clear_line(toys: Path):
-    code, said = verify(toys, "worker.seconds=0")
-    assert code == 0, said
-    with pytest.raises(Refused, match="wrong"):
-        verify(toys, "worker.wrong=0")
+def test_a_setting_that_does_not_exist_is_refused(toys: Path):
+    code, said = verify(toys, "worker.wrong=0")
+    assert code == 2
+    assert "worker.config.wrong: unknown key 'wrong'" in said
+
+
+def test_a_stage_that_dies_is_one_clear_line(toys: Path, tmp_path: Path):
+    code, said = verify(toys, "worker.die_at=2")
+    assert code == 1
+    assert "worker (1 of 2): could not be executed: its process killed by SIGKILL" in said
+    assert "NOT VERIFIED" in said
 
 
 def test_without_verify_only_says_what_would_be_executed(toys: Path):
-    lines: list[str] = []
-    assert replay(toys, verify=False, say=lines.append) == 0
-    said = "\n".join(lines)
+    code, said = replay(toys)
+    assert code == 0
     assert "device: its messages are taken from the recording" in said
     assert "executed again" in said
     assert "IDENTICAL" not in said
 
 
-def test_names_what_has_changed_since(toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    packages = json.loads(Recording(toys).run["packages"])
-    monkeypatch.setattr("runner.replay.package_versions", lambda: {**packages, "numpy": "9.9"})
-    _, said = verify(toys)
-    assert f"changed since the recording: numpy {packages['numpy']} -> 9.9" in said
+def with_metadata(toys: Path, target: Path, **aspects: str) -> Path:
+    """A copy whose origin says something else."""
+    return rewrite(toys, target, lambda _, data: data, aspects)
+
+
+def test_names_what_has_changed_since(toys: Path, tmp_path: Path):
+    packages = {**json.loads(Recording(toys).run["packages"]), "mcap": "0.0.1"}
+    code, said = verify(with_metadata(toys, tmp_path / "copy.mcap", packages=json.dumps(packages), revision="0ld"))
+    assert code == 0
+    assert said.startswith("changed since the recording: mcap 0.0.1 -> ")
+    assert "source 0ld -> " in said
+
+
+def elsewhere(toys: Path, target: Path, by: float) -> Path:
+    """As if recorded on another processor, where one float came out differently."""
+    machine = {**json.loads(Recording(toys).run["machine"]), "processor": "Z80"}
+    samples = Recording(toys).envelope("worker.answer#0")
+
+    def nudge(topic: str, data: bytes) -> bytes:
+        sealed = unpack(Envelope, data) if topic == "worker/answer" else None
+        if sealed is None or sealed.id != samples.id:
+            return data
+        answer = decode(Answer, sealed.body)
+        moved = msgspec.structs.replace(answer, samples=answer.samples + by)
+        return pack(msgspec.structs.replace(sealed, body=envelope(moved, **HEADER).body))
+
+    return rewrite(toys, target, nudge, {"machine": json.dumps(machine)})
+
+
+def test_on_another_machine_it_says_so_first_and_tolerances_apply(toys: Path, tmp_path: Path):
+    code, said = verify(elsewhere(toys, tmp_path / "near.mcap", 1e-7), TABLE)
+    assert code == 0, said
+    assert said.startswith("FINGERPRINT DIFFERS: processor Z80 -> ")
+    assert "WITHIN TOLERANCES: 2 of 45 messages of 4 stages differ, no field by more than " in said
+    assert "IDENTICAL" not in said
+
+
+def test_beyond_its_tolerance_a_message_diverges_on_another_machine_too(toys: Path, tmp_path: Path):
+    code, said = verify(elsewhere(toys, tmp_path / "far.mcap", 1e-3), TABLE)
+    assert code == 1
+    assert "DIVERGED first at stage worker[0], step 0, message worker.answer#0: samples[0]" in said
+
+
+def test_a_graph_without_tolerances_has_none(toys: Path, tmp_path: Path):
+    code, said = verify(elsewhere(toys, tmp_path / "near.mcap", 1e-7))
+    assert code == 1
+    assert said.startswith("FINGERPRINT DIFFERS")
+    assert "DIVERGED first" in said
+
+
+def test_what_is_equal_is_identical_on_another_machine(toys: Path, tmp_path: Path):
+    code, said = verify(elsewhere(toys, tmp_path / "equal.mcap", 0.0), TABLE)
+    assert code == 0
+    assert "IDENTICAL: 45 messages" in said
+
+
+def test_on_the_same_machine_tolerances_never_apply(toys: Path, tmp_path: Path):
+    here = Recording(toys).run["machine"]
+    nudged = elsewhere(toys, tmp_path / "near.mcap", 1e-7)
+    code, said = verify(rewrite(nudged, tmp_path / "here.mcap", lambda _, data: data, {"machine": here}), TABLE)
+    assert code == 1
+    assert "TOLERANCES" not in said
+    assert "DIVERGED first at stage worker[0]" in said
+
+
+@pytest.mark.parametrize(
+    ("table", "error"),
+    [
+        ("tests.runner.toys:TOLERANCE", "no class 'TOLERANCE' in tests.runner.toys"),
+        ("tests.runner.toys:Counter", "tests.runner.toys:Counter is a type; valid: a mapping of Type.field"),
+    ],
+)
+def test_a_table_that_is_none_is_refused(toys: Path, tmp_path: Path, table: str, error: str):
+    code, said = verify(elsewhere(toys, tmp_path / "near.mcap", 0.0), f"tolerances={table}")
+    assert code == 2
+    assert error in said
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_any_number_of_workers_gives_the_same_bytes(toys: Path, workers: int):
+    code, said = verify(toys, workers=workers)
+    assert code == 0, said
+    assert "IDENTICAL: 45 messages of 4 stages" in said

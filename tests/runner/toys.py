@@ -6,12 +6,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.contract import Context, Finished, Message, Part, Refused, Restarted, Spec, Stage
+from runner.contract import Command, Context, Finished, Message, Part, Refused, Restarted, Spec, Stage, Tolerance
 
 Vector = Annotated[NDArray[np.float64], Spec("float64", ("N",))]
 
@@ -36,6 +36,9 @@ class Answer(Part, frozen=True, kw_only=True):
 class Total(Message, frozen=True, kw_only=True):
     samples: Vector
     last: bool
+
+
+TOLERANCES = {"Answer.samples": Tolerance(1e-6), "Total.samples": Tolerance(1e-6)}
 
 
 class Counter(Stage):
@@ -161,6 +164,52 @@ class DoubleSink(Stage):
             file.write(f"{double.value}\n")
         self._seen += 1
         return Finished(code=0, reason=f"{self._seen} doubles") if self._seen == self._config.count else None
+
+
+class Sum(Message, frozen=True, kw_only=True):
+    total: int
+    calls: int
+
+
+class Add(Command, frozen=True, kw_only=True):
+    """Adds to the account."""
+
+    amount: int
+    """May be negative."""
+    mood: Literal["glad", "sad"] = "glad"
+    note: str = ""
+
+
+class Collect(Command, frozen=True, kw_only=True):
+    """Adds the numbers that come until there are ``count`` of them."""
+
+    answer = Sum
+
+    count: int
+
+
+class Account(Stage):
+    """Does what it is told, and counts how often."""
+
+    def __init__(self):
+        self._total = self._calls = self._left = 0
+
+    def on_add(self, add: Add, ctx: Context) -> Sum:
+        if add.amount == 0:
+            raise Refused("amount=0: nothing to add; valid: any other number")
+        self._total += add.amount
+        self._calls += 1
+        ctx.log(f"{add.amount} added {add.note}".rstrip())
+        return Sum(total=self._total, calls=self._calls)
+
+    def on_collect(self, collect: Collect, ctx: Context) -> None:
+        self._left = collect.count
+        ctx.log(f"collecting {collect.count}")
+
+    def on_number(self, number: Number) -> Sum | None:
+        self._left -= 1
+        self._total += self._left >= 0
+        return Sum(total=self._total, calls=self._calls) if self._left == 0 else None
 
 
 class RestartWatcher(Stage):
