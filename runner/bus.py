@@ -37,6 +37,7 @@ import traceback
 import uuid
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -71,8 +72,10 @@ class Process:
 
     @staticmethod
     def of(key: str) -> Process:
-        """The process that a key ends with."""
+        """The process that a key ends with; raises Refused where it names none."""
         stage, replica, incarnation = key.split("/")[-3:]
+        if not all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (replica, incarnation)):
+            raise Refused(f"names no process: {key[-60:]}; valid: STAGE/REPLICA/INCARNATION")
         return Process(stage, int(replica), int(incarnation))
 
     @property
@@ -90,10 +93,21 @@ class Packet:
     sent_ns: int
     """Monotonic clock of this machine when it was sent; 0 where the sender did not say or has another clock."""
     arrived_ns: int
+    genuine: bool = True
+    """Whether it comes from a process of this run: see :func:`_badge`."""
 
 
-_SENT = struct.Struct("<qQ")
-"""What accompanies a message: when it was sent, and by which clock."""
+_SENT = struct.Struct("<qQ8s")
+"""What accompanies a message: when it was sent, by which clock, and the sender's badge."""
+
+
+@lru_cache(4096)
+def _badge(secret: str, path: str) -> bytes:
+    """What the processes of one run, who share its secret, show with everything they publish on a key.
+
+    It keeps out what strays in, from another program or another run; who may come in at all is for TLS to say.
+    """
+    return hashlib.blake2b(path.encode(), key=secret.encode(), digest_size=8).digest()
 
 
 def _clock() -> int:
@@ -114,13 +128,17 @@ class Bus:
     """
 
     def __init__(
-        self, run: str, *, listen: str | None = None, connect: str | None = None, network: Network | None = None
+        self, run: str, *, listen: str | None = None, connect: str | None = None, network: Network | None = None,
+        secret: str = "",
     ):
         """``connect`` is called first; without a ``network`` all of it stays on loopback.
+
+        What is published without the run's ``secret`` is refused by its processes.
 
         Raises Refused where this machine cannot listen as it is told.
         """
         self._run = run
+        self._secret = secret
         self._session = _open(_config(listen, connect, network))
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -138,14 +156,16 @@ class Bus:
                 reliability=zenoh.Reliability.RELIABLE,
             )
             self._publishers[path] = publisher
-        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
+        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path)))
 
     def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
         """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed)."""
 
         def receive(sample: zenoh.Sample, arrived_ns: int) -> None:
             key = str(sample.key_expr).removeprefix(f"{self._run}/")
-            callback(Packet(key, sample.payload.to_bytes(), _sent_ns(sample), arrived_ns))
+            sent_ns, badge = _attached(sample)
+            genuine = badge == _badge(self._secret, key)
+            callback(Packet(key, sample.payload.to_bytes(), sent_ns, arrived_ns, genuine))
 
         self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", self._in_turn(receive)))
 
@@ -153,14 +173,25 @@ class Bus:
         """Declares this process present, until it closes or dies."""
         self._declared.append(self._session.liveliness().declare_token(f"{self._run}/present/{process.path}"))
 
-    def watch(self, callback: Callable[[Process, bool], None]) -> None:
-        """Calls back for every process that is or becomes present (True) and that goes (False)."""
+    def watch(
+        self, callback: Callable[[Process, bool], None], refuse: Callable[[str, Exception], None] = lambda *_: None
+    ) -> None:
+        """Calls back for every process that is or becomes present (True) and that goes (False).
+
+        ``refuse`` is told of keys that name none.
+        """
 
         def receive(sample: zenoh.Sample, _: int) -> None:
-            callback(Process.of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+            key = str(sample.key_expr)
+            try:
+                process = Process.of(key)
+            except Refused as refusal:
+                refuse(key.removeprefix(f"{self._run}/"), refusal)
+            else:
+                callback(process, sample.kind == zenoh.SampleKind.PUT)
 
         subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._run}/present/*/*/*", self._in_turn(receive), history=True
+            f"{self._run}/present/**", self._in_turn(receive), history=True
         )
         self._declared.append(subscriber)
 
@@ -170,14 +201,15 @@ class Bus:
 
         def answer(query: zenoh.Query, _: int) -> None:
             with query:
-                query.reply(key, b"")
+                query.reply(key, _badge(self._secret, "flush"))
 
         self._declared.append(self._session.declare_queryable(key, self._in_turn(answer)))
 
     def flush(self) -> bool:
         """Waits until the recorder has received everything sent before; False where it does not answer in time."""
         replies = self._session.get(f"{self._run}/flush", timeout=FLUSH_SECONDS)
-        return any(reply.ok is not None for reply in replies)
+        badge = _badge(self._secret, "flush")
+        return any(reply.ok is not None and reply.ok.payload.to_bytes() == badge for reply in replies)
 
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
@@ -322,9 +354,10 @@ def _config(listen: str | None, connect: str | None, network: Network | None, mo
     return config
 
 
-def _sent_ns(sample: zenoh.Sample) -> int:
+def _attached(sample: zenoh.Sample) -> tuple[int, bytes]:
+    """When it was sent, 0 where that is not known, and the sender's badge."""
     data = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if len(data) != _SENT.size:
-        return 0
-    sent_ns, clock = _SENT.unpack(data)
-    return sent_ns if clock == _CLOCK else 0
+        return 0, b""
+    sent_ns, clock, badge = _SENT.unpack(data)
+    return (sent_ns if clock == _CLOCK else 0), badge
