@@ -1,8 +1,8 @@
 """Fits how sure the estimator says it is, and shows whether that is right: `python -m benchmarks.calibration FOLDER`.
 
-Renders two disjoint sets of cluttered scenes into FOLDER, estimates both from exact and from noisy boxes (kept there,
-so that a second call only fits), writes the constants of the first set to ``stages/perception/calibration.yaml`` and
-prints the reliability of the second.
+Renders piles of several kinds into FOLDER, each in two disjoint sets, estimates them from exact and from noisy boxes
+(kept there, so that a second call only fits), writes the constants of the training sets to
+``stages/perception/calibration.yaml`` and prints the reliability on the test sets.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from scipy.optimize import minimize, minimize_scalar
 from benchmarks.datasets import Image, detections_file, images
 from benchmarks.estimate import Settings, estimates
 from benchmarks.pipeline import Estimate
-from stages.devices.clutter import write_clutter
+from stages.devices.clutter import Pile, write_clutter
 from stages.messages import Hypothesis, Observation, SceneEstimate
+from stages.perception.depth_noise import StructuredLight
 from stages.perception.doubt import (
     CONSTANTS,
     FEATURES,
@@ -48,15 +49,58 @@ _ROOT = Path(__file__).parents[1]
 _CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
 _PLOT = _ROOT / "docs" / "figures" / "reliability.png"
 _SEEDS = {"train": 1001, "test": 3003}
-"""Of the scenes; Clutter-15 has seed 0."""
-_POSE_SCALES = (7.0, 20.0, 60.0)
-_SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1), strict=True))
+"""Of the first kind of piles, the others follow; Clutter-15 has seed 0."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Piles of one kind, and how many scenes of each set are estimated from exact and from noisy boxes."""
+
+    pile: Pile
+    exact: int
+    noisy: int
+
+
+_COARSE = StructuredLight(
+    disparity_sigma=0.14, disparity_step=0.25, lateral_sigma=1.0, edge_dropout=0.6, flying=0.2, holes=0.02
+)
+_STANDING = ("mug", "cup", "soup_can", "tuna_can", "sauce_bottle", "water_bottle", "sugar_box", "tea_box",
+             "milk_carton", "salt_shaker")  # fmt: skip
+"""Objects that look nearly the same when they are turned or flipped."""
+KINDS = {
+    "clutter": Kind(Pile(), exact=30, noisy=15),
+    "coarse": Kind(
+        Pile(
+            counts=(6, 7, 5, 8, 6), spread=0.035, least_visible=0.04, distance=(1.1, 1.7), sensor=_COARSE,
+            jitter=0.1, false=(2, 4),
+        ), exact=60, noisy=20,
+    ),
+    "low": Kind(
+        Pile(
+            counts=(7, 6, 8, 7, 5), labels=_STANDING, spread=0.03, least_visible=0.03, pitch=(8.0, 30.0),
+            jitter=0.1, false=(2, 4),
+        ), exact=48, noisy=24,
+    ),
+    "heaps": Kind(
+        Pile(
+            counts=(8, 9, 7, 10, 8), spread=0.03, least_visible=0.03, views=8, pitch=(20.0, 55.0),
+            jitter=0.1, false=(2, 4),
+        ), exact=24, noisy=12,
+    ),
+}  # fmt: skip
+"""Clutter-15's piles; seen from afar by a coarse sensor; standing objects seen from low down, which hides handles and
+shows flips alike; and heaps in which objects show a few percent of themselves."""
+POSE_SCALES = (10.0, 20.0, 40.0)
+"""Readings that count as one, to choose from."""
+_SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1), strict=True))
 """Which way evidence points: a fit to few scenes must not turn it round."""
 _RIDGE = 1.0
 _PRIOR = {"margin": 0.5, "fit": -1.0, "gain": 1.0, "looked through": -1.0}
 """Weights that the ridge pulls towards: log-odds of half the margin, which is what its theory says, tempered; and one
 nat per deviation for an object that does not fit its readings. Few scenes show a pose that is certain and wrong."""
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
+_COARSE_BINS = (0.0, 0.5, 0.85, 0.95, 1.0)
+"""There are fewer images than objects."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +121,8 @@ class Instance:
 class Scene:
     """One estimated image."""
 
+    kind: str
+    """Of :data:`KINDS`."""
     boxes: str
     """``exact`` or ``noisy``."""
     winner: int
@@ -106,10 +152,10 @@ class Recorder:
         constants = Calibration.load()
         self._judges = {
             str(scale): Judge(catalogue, dof=6, calibration=replace(constants, pose_scale=scale, spread_scale=1.0))
-            for scale in _POSE_SCALES
+            for scale in POSE_SCALES
         }
 
-    def scene(self, image: Image, boxes: str, estimate: Estimate) -> Scene:
+    def scene(self, image: Image, kind: tuple[str, str], estimate: Estimate) -> Scene:
         """One image, refined again to see what the refiner compared."""
         observation, *_ = (item for item in estimate.messages if isinstance(item, Observation))
         ranked, *_ = (item for item in estimate.messages if isinstance(item, SceneEstimate))
@@ -125,7 +171,8 @@ class Recorder:
         sets = _hypothesised(estimate)
         true = sorted(self._name(truth.label) for truth in image.truths)
         return Scene(
-            boxes=boxes,
+            kind=kind[0],
+            boxes=kind[1],
             winner=ranked.winner,
             winner_right=sorted(item.label for item in ranked.objects) == true,
             true_hypothesis=sets.index(true) if true in sets else -1,
@@ -157,26 +204,34 @@ def _hypothesised(estimate: Estimate) -> list[list[str]]:
     return [sorted(candidate.label for candidate in item.candidates) for item in found]
 
 
-def scenes(folder: Path, name: str, counts: dict[str, int], processes: int) -> list[Scene]:
-    """The estimated scenes of one set; estimated once and then read from ``folder``."""
+def scenes(folder: Path, name: str, most: int | None, processes: int) -> list[Scene]:
+    """The estimated scenes of one set; rendered and estimated once and then read from ``folder``.
+
+    ``most`` is the number of scenes of each kind of piles and boxes that are used at most.
+    """
     found: list[Scene] = []
-    for boxes, count in counts.items():
-        path = folder / f"{name}-{boxes}.jsonl"
-        done = (
-            [msgspec.json.decode(line, type=Scene) for line in path.read_text().splitlines()] if path.is_file() else []
-        )
-        if len(done) < count:
-            done += _estimated(folder / name, boxes, range(len(done), count), path, processes)
-        found += done[:count]
+    for number, (kind, setting) in enumerate(KINDS.items()):
+        dataset = folder / f"{name}-{kind}"
+        for boxes, count in (("exact", setting.exact), ("noisy", setting.noisy)):
+            wanted = count if most is None else min(count, most)
+            path = folder / f"{dataset.name}-{boxes}.jsonl"
+            lines = path.read_text().splitlines() if path.is_file() else []
+            done = [msgspec.json.decode(line, type=Scene) for line in lines]
+            if len(done) < wanted:
+                generate(dataset, setting.pile, max(setting.exact, setting.noisy), _SEEDS[name] + number)
+                done += _estimated(path, (kind, boxes), range(len(done), wanted), processes)
+            found += done[:wanted]
     return found
 
 
-def _estimated(dataset: Path, boxes: str, wanted: range, path: Path, processes: int) -> list[Scene]:
-    chosen = [image for image in images(dataset, detections_file(dataset, boxes)) if image.frame.index in wanted]
+def _estimated(path: Path, kind: tuple[str, str], wanted: range, processes: int) -> list[Scene]:
+    """Estimates further scenes of a kind of piles and boxes, and keeps what is found in a file."""
+    dataset = path.with_name(path.stem.removesuffix(f"-{kind[1]}"))
+    chosen = [image for image in images(dataset, detections_file(dataset, kind[1])) if image.frame.index in wanted]
     recorder = Recorder(Catalogue.load(dataset / "models"))
     done: list[Scene] = []
     for image, estimate in zip(chosen, estimates(dataset, chosen, Settings(processes=processes)), strict=True):
-        done.append(recorder.scene(image, boxes, estimate))
+        done.append(recorder.scene(image, kind, estimate))
         with path.open("a") as file:
             file.write(msgspec.json.encode(done[-1]).decode() + "\n")
         wrong = sum(not item.right for item in done[-1].instances)
@@ -190,18 +245,22 @@ def _estimated(dataset: Path, boxes: str, wanted: range, path: Path, processes: 
 def fit(train: Sequence[Scene]) -> Calibration:
     """Constants of greatest likelihood; the pose scale is the best of a few."""
     hypothesis = _fit_hypotheses(train)
-    fits = [_fit_poses(train, hypothesis, scale) for scale in _POSE_SCALES]
-    for scale, (_, loss) in zip(_POSE_SCALES, fits, strict=True):
+    fits = [_fit_poses(train, hypothesis, scale) for scale in POSE_SCALES]
+    for scale, (_, loss) in zip(POSE_SCALES, fits, strict=True):
         print(f"pose scale {scale:5.0f}: log loss {loss:.4f}")
     return min(fits, key=lambda each: each[1])[0]
 
 
 def _fit_hypotheses(train: Sequence[Scene]) -> float:
-    """The scale at which the true set of objects is most likely, where it is among several."""
-    doubtful = [scene for scene in train if len(scene.log_weights) > 1 and scene.true_hypothesis >= 0]
+    """The scale at which the true set of objects is most likely, or the winner least where that set is not there."""
+    doubtful = [scene for scene in train if len(scene.log_weights) > 1]
+
+    def likelihood(scene: Scene, scale: float) -> float:
+        found = scene.probabilities(scale)
+        return float(1 - found[scene.winner] if scene.true_hypothesis < 0 else found[scene.true_hypothesis])
 
     def loss(log_scale: float) -> float:
-        chosen = [scene.probabilities(np.exp(log_scale))[scene.true_hypothesis] for scene in doubtful]
+        chosen = [likelihood(scene, float(np.exp(log_scale))) for scene in doubtful]
         # A scale that makes every scene certain is not to be learnt from a few scenes that are all right.
         return float(-np.log(np.maximum(chosen, 1e-12)).sum() + 0.1 * (log_scale - np.log(0.1)) ** 2)
 
@@ -290,10 +349,10 @@ def wilson(right: int, count: int) -> tuple[float, float]:
     return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 
-def reliability(called: Floats, right: Floats) -> list[Bin]:
+def reliability(called: Floats, right: Floats, edges: Sequence[float] = _BINS) -> list[Bin]:
     """Bins that hold something."""
     found: list[Bin] = []
-    for low, high in pairwise(_BINS):
+    for low, high in pairwise(edges):
         inside = (called >= low) & ((called < high) | (high == 1.0))
         if inside.any():
             found.append(Bin(low, high, float(called[inside].mean()), int(right[inside].sum()), int(inside.sum())))
@@ -318,48 +377,65 @@ def table(bins: Sequence[Bin]) -> str:
     return "\n".join([*lines, f"expected calibration error {expected_error(bins):.3f}"])
 
 
-def evaluate(test: Sequence[Scene], constants: Calibration) -> list[Bin]:
-    """Prints what the constants are worth on scenes that they were not fitted to."""
+def evaluate(test: Sequence[Scene], constants: Calibration) -> tuple[list[Bin], list[Bin]]:
+    """Prints what the constants are worth on these scenes; the bins of the poses and those of the winners."""
     X, right = design(test, constants.hypothesis_scale, constants.pose_scale)
     called = np.array([constants.probability(row) for row in X])
     bins = reliability(called, right)
     print(f"\n{len(right)} objects in {len(test)} estimates, {right.mean():.1%} right\n{table(bins)}")
-    for name in ("exact", "noisy"):
-        chosen = np.array([scene.boxes == name for scene in test for _ in scene.instances])
-        if chosen.any():
-            print(f"{name} boxes: called {called[chosen].mean():.3f}, right {right[chosen].mean():.3f}")
+    of = np.array([(scene.kind, scene.boxes) for scene in test for _ in scene.instances])
+    for kind, boxes in dict.fromkeys(map(tuple, of.tolist())):
+        chosen = (of[:, 0] == kind) & (of[:, 1] == boxes)
+        print(f"{kind:8} {boxes} boxes: called {called[chosen].mean():.3f}, right {right[chosen].mean():.3f} "
+              f"of {chosen.sum()}")  # fmt: skip
     order = np.argsort(called)[: max(1, len(called) // 10)]
     print(f"the least sure tenth holds {np.sum(~right[order])} of {np.sum(~right)} errors")
+    return bins, _evaluate_winners(test, constants)
+
+
+def _evaluate_winners(test: Sequence[Scene], constants: Calibration) -> list[Bin]:
     several = [scene for scene in test if len(scene.log_weights) > 1]
-    if several:
-        sure = [float(scene.probabilities(constants.hypothesis_scale)[scene.winner]) for scene in several]
-        print(f"winning hypotheses: called {np.mean(sure):.3f}, "
-              f"right {np.mean([scene.winner_right for scene in several]):.3f} of {len(several)}")  # fmt: skip
+    if not several:
+        return []
+    sure = np.array([float(scene.probabilities(constants.hypothesis_scale)[scene.winner]) for scene in several])
+    right = np.array([scene.winner_right for scene in several])
+    bins = reliability(sure, right, _COARSE_BINS)
+    print(f"winning hypotheses: called {sure.mean():.3f}, right {right.mean():.3f} of {len(several)}\n{table(bins)}")
     return bins
 
 
-def plot(bins: Sequence[Bin], path: Path) -> None:
-    """The reliability diagram."""
+def plot(poses: Sequence[Bin], winners: Sequence[Bin], path: Path) -> None:
+    """The reliability diagrams of poses and, where there were several hypotheses, of the winning ones."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(5.2, 5.0), layout="constrained")
+    shown = [("Poses within 2 cm and 15 degrees (numbers: objects)", poses)]
+    shown += [("Winning hypotheses (numbers: images)", winners)] if winners else []
+    figure, axes = plt.subplots(
+        1, len(shown), figsize=(5.2 * len(shown), 5.0), layout="constrained", sharey=True, squeeze=False
+    )
+    for each, (title, bins) in zip(axes[0], shown, strict=True):
+        _draw(each, bins)
+        each.set(xlabel="probability that was reported", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
+    axes[0, 0].set(ylabel="share that is right")
+    axes[0, 0].legend(loc="upper left", frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _draw(axes: Any, bins: Sequence[Bin]) -> None:
     axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfect")
     axes.axvspan(0.85, 0.95, color="0.93", zorder=0)
     called = [each.called for each in bins]
     right = np.array([each.right / each.count for each in bins])
     ends = np.array([each.interval for each in bins]).T
-    axes.errorbar(called, right, yerr=np.abs(ends - right), fmt="o", color="#2c6fbb", capsize=3, label="test scenes")
+    axes.errorbar(called, right, yerr=np.maximum(np.abs(ends - right), 0.0), fmt="o", color="#2c6fbb", capsize=3,
+                  label="test scenes, 95 %")  # fmt: skip
     for each, x, y in zip(bins, called, right, strict=True):
         axes.annotate(str(each.count), (x, y), textcoords="offset points", xytext=(7, -11), fontsize=8, color="0.35")
-    axes.set(xlabel="probability that was reported", ylabel="share within 2 cm and 15 degrees", xlim=(0, 1.02),
-             ylim=(0, 1.02), title="Reliability of poses (numbers: objects)")  # fmt: skip
-    axes.legend(loc="upper left", frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(figure)
 
 
 def write_constants(constants: Calibration, path: Path, command: str) -> None:
@@ -372,35 +448,33 @@ def write_constants(constants: Calibration, path: Path, command: str) -> None:
     path.write_text(head + yaml.safe_dump(rounded, sort_keys=False, default_flow_style=None, width=110))
 
 
-def generate(folder: Path, name: str, count: int) -> None:
+def generate(dataset: Path, pile: Pile, count: int, seed: int) -> None:
     """Renders a set of scenes, unless as many are there."""
-    targets = folder / name / "test_targets_bop19.json"
+    targets = dataset / "test_targets_bop19.json"
     there = {item["scene_id"] for item in json.loads(targets.read_text())} if targets.is_file() else set[int]()
     if len(there) < count:
-        print(f"rendering {count} {name} scenes", flush=True)
-        write_clutter(folder / name, Catalogue.load(_CATALOGUE), scenes=count, seed=_SEEDS[name])
+        print(f"rendering {count} scenes of {dataset.name}", flush=True)
+        write_clutter(dataset, Catalogue.load(_CATALOGUE), scenes=count, seed=seed, pile=pile)
 
 
 def main() -> None:
     """Fits and evaluates."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where scenes and estimates are kept; empty it to begin anew")
-    parser.add_argument("--exact", type=int, default=80, help="scenes of each set estimated from exact boxes")
-    parser.add_argument("--noisy", type=int, default=30, help="scenes of each set estimated from noisy boxes")
+    parser.add_argument("--most", type=int, help="scenes of each kind of piles and boxes, at most")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--evaluate", action="store_true", help="keep the constants that are there")
     options = parser.parse_args()
-    counts = {"exact": options.exact, "noisy": options.noisy}
-    sets = ("test",) if options.evaluate else ("train", "test")
-    for name in sets:
-        generate(options.folder, name, max(counts.values()))
-    found = {name: scenes(options.folder, name, counts, options.processes) for name in sets}
     if not options.evaluate:
-        command = f"python -m benchmarks.calibration FOLDER --exact {options.exact} --noisy {options.noisy}"
-        write_constants(fit(found["train"]), CONSTANTS, command)
+        train = scenes(options.folder, "train", options.most, options.processes)
+        command = "python -m benchmarks.calibration FOLDER" + (f" --most {options.most}" if options.most else "")
+        write_constants(fit(train), CONSTANTS, command)
         Calibration.load.cache_clear()
-        evaluate(found["train"], Calibration.load())
-    plot(evaluate(found["test"], Calibration.load()), _PLOT)
+        print("\nthe training sets:")
+        evaluate(train, Calibration.load())
+        print("\nthe test sets:")
+    test = scenes(options.folder, "test", options.most, options.processes)
+    plot(*evaluate(test, Calibration.load()), _PLOT)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,10 @@ from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 RIGHT_METRES = 0.02
 RIGHT_RADIANS = np.deg2rad(15.0)
 """A pose within these of the truth, modulo the object's symmetries, is right."""
-FEATURES = ("margin", "fit", "shown", "gain", "looked through", "spread", "hypothesis", "confidence")
+FEATURES = (
+    "margin", "fit", "shown", "gain", "looked through", "spread", "hypothesis", "confidence", "unexplained", "sunk",
+    "agreement",
+)  # fmt: skip
 """What a probability is made of; :func:`Evidence.features`."""
 ORDINARY_NOISE = 0.00125
 """Metres; where the plane shows too little to tell."""
@@ -57,6 +60,11 @@ _ABOUT = (np.deg2rad(60.0), 0.06)
 _KEPT = 4
 _LIKELY = 0.1
 """Alternatives kept at most, and the least weight that one has relative to the estimate."""
+_OFF = 0.012
+"""Metres along the ray, at one metre, beyond which a reading does not lie on a surface; grows with the square of depth
+as the noise of triangulation does."""
+_DEEPEST = 0.04
+"""Metres below the plane from which on an object lies as wrong as can be."""
 _FARTHEST = 3.0
 _CAP = 12.0
 """Nats beyond which evidence is as good as any."""
@@ -88,9 +96,15 @@ class Calibration:
             Refused: the file is not of that form; names file and key.
         """
         try:
-            return msgspec.convert(yaml.safe_load(path.read_text()), Calibration)
+            found = msgspec.convert(yaml.safe_load(path.read_text()), Calibration)
         except (OSError, yaml.YAMLError, msgspec.ValidationError) as error:
             raise Refused(f"{path}: {error}; `python -m benchmarks.calibration` writes this file") from None
+        for key in ("weights", "centres", "scales"):
+            if len(getattr(found, key)) != len(FEATURES):
+                raise Refused(
+                    f"{path}: {key} has {len(getattr(found, key))} numbers; there are {len(FEATURES)} features"
+                )
+        return found
 
     def probability(self, features: Floats) -> float:
         """That a pose with these features is right."""
@@ -128,6 +142,8 @@ class Judged:
     """The detector's."""
     rivals: tuple[Rival, ...] = ()
     """Other poses that the estimator considered."""
+    box: Floats | None = None
+    """The detector's, x0, y0, x1, y1 in pixels; None where there was none."""
 
 
 @dataclass(frozen=True)
@@ -147,15 +163,22 @@ class Evidence:
     looked_through: float
     spread_metres: float
     spread_radians: float
+    breadth: float
+    """Spread of the tempered likelihood relative to what counts as right, before it is scaled to that of the errors."""
     hypothesis: float
     """Probability of the scene's hypothesis."""
     confidence: float
+    sunk: float = 0.0
+    """How far its lowest point lies below the plane, metres."""
+    unexplained: float = 0.0
+    """Share of the foreground readings in its box that no object of the scene explains."""
+    agreement: float = 1.0
+    """Intersection over union of its box and of that of its silhouette in front of the other objects."""
     noise: float = ORDINARY_NOISE
     """How far readings of the plane lie from it, metres."""
 
     def features(self) -> Floats:
         """The numbers that :data:`FEATURES` names."""
-        spread = max(self.spread_metres / RIGHT_METRES, self.spread_radians / RIGHT_RADIANS)
         odds = np.clip(self.hypothesis, 1e-4, 1 - 1e-4)
         return np.array([
             np.clip(self.margin, -_CAP, _CAP),
@@ -163,9 +186,12 @@ class Evidence:
             np.log(max(self.shown, 10.0)),
             np.clip(self.gain, -1.0, 1.0),
             self.looked_through,
-            np.log(np.clip(spread, 1e-2, 10.0)),
+            np.log(np.clip(self.breadth, 1e-2, 10.0)),
             np.log(odds / (1 - odds)),
             self.confidence,
+            self.unexplained,
+            min(self.sunk, _DEEPEST) / RIGHT_METRES,
+            self.agreement,
         ])  # fmt: skip
 
 
@@ -225,7 +251,8 @@ def judged(item: ObjectPose, refined: RefinedObject) -> Judged:
     mine, *others = refined.considered or (None,)
     own = None if mine is None else mine.colour
     rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
-    return Judged(refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals))
+    rivals = tuple(Rival(*rival) for rival in rivals)
+    return Judged(refined.label, refined.T_camera_object, item.confidence, rivals, item.box)
 
 
 def annotated(estimate: SceneEstimate, doubt: SceneDoubt) -> SceneEstimate:
@@ -292,14 +319,14 @@ class Judge:
         self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
     ) -> list[tuple[Evidence, Others]]:
         """What the image says of each object's pose; ``hypothesis`` is the probability of the scene's."""
-        noise = noise_of(scene)
+        noise, lonely = noise_of(scene), _unexplained(scene, layers)
         found: list[tuple[Evidence, Others]] = []
         for i, item in enumerate(objects):
             others = np.maximum.reduce([scene.plane_inverse, *layers[:i], *layers[i + 1 :]])
             T = np.array(item.T_camera_object[:3], float)
             look = _Look(scene, self._model(item.label), T, layers[i], others)
             evidence, rest = look.evidence(item, self._calibration, hypothesis)
-            found.append((replace(evidence, noise=noise), rest))
+            found.append((replace(evidence, noise=noise, unexplained=_share(lonely, scene, item.box)), rest))
         return found
 
     def layers(self, scene: ObservedScene, objects: Sequence[Judged]) -> list[Float32s]:
@@ -369,8 +396,11 @@ class _Look:
             looked_through=looked_through(self._scene, self._layer, self._others),
             spread_metres=max(constants.spread_scale * near_metres, wide_metres),
             spread_radians=max(constants.spread_scale * near_radians, wide_radians),
+            breadth=max(max(near_metres, wide_metres) / RIGHT_METRES, max(near_radians, wide_radians) / RIGHT_RADIANS),
             hypothesis=hypothesis,
             confidence=item.confidence,
+            sunk=self._sunk(),
+            agreement=self._agreement(item.box),
         )
         kept = cells[: min(likely, _KEPT)]
         return evidence, Others(probes[away][kept], np.minimum(weights[: len(kept)], 1.0))
@@ -445,6 +475,24 @@ class _Look:
         gain = float((self._likelihood.base - own) / (form.truncation * max(1.0, count)))
         return fit, count, float(shown.sum() / max(1, silhouette.sum())), gain
 
+    def _sunk(self) -> float:
+        """How far the lowest point of the object lies below the plane, metres."""
+        points = rotate(self._pose[:, :3], self._model.shape.support.astype(float)) + self._pose[:, 3]
+        plane = self._scene.plane.astype(float)
+        return max(0.0, -float(((points * plane[:3]).sum(-1) + plane[3]).min()))
+
+    def _agreement(self, box: Floats | None) -> float:
+        """Intersection over union of a box and of that of what no other object hides."""
+        shown = (self._layer > 0) & (self._layer >= self._others)
+        if box is None or not shown.any():
+            return float(box is None)
+        columns, rows = np.flatnonzero(shown.any(0)), np.flatnonzero(shown.any(1))
+        mine = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
+        low, high = np.maximum(mine[:2], box[:2]), np.minimum(mine[2:], box[2:])
+        both = float(np.maximum(high - low, 0.0).prod())
+        either = sum(float(np.maximum(each[2:] - each[:2], 0.0).prod()) for each in (mine, box)) - both
+        return both / max(either, 1.0)
+
     @property
     def _stride(self) -> float:
         return self._scene.view.fx / self._likelihood.window.view.fx
@@ -480,6 +528,21 @@ def _likelihood(scene: ObservedScene, shape: Shape, pose: Floats, others: Float3
     region = (x0, y0, x1, y1)
     stride = max(1, int(apparent / _DETAIL))
     return ObjectLikelihood(shape, Window.of(scene, others, region, region, stride=stride, form=_FORM), scene, _FORM)
+
+
+def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> NDArray[np.bool_]:
+    """Foreground readings that lie on no object, H x W; at silhouettes they may be of either side and count too."""
+    nearest = np.maximum.reduce([scene.plane_inverse, *layers])
+    gap = np.abs(1.0 / np.where(nearest > 0, nearest, np.inf) - scene.depth)
+    return scene.foreground & (gap > _OFF * np.maximum(scene.depth, 1.0) ** 2)
+
+
+def _share(mask: NDArray[np.bool_], scene: ObservedScene, box: Floats | None) -> float:
+    """Share of the foreground in a box that is in the mask; 0 where there is no box."""
+    if box is None:
+        return 0.0
+    x0, y0, x1, y1 = np.clip(np.round(box), 0, np.tile(mask.shape[::-1], 2)).astype(int).tolist()
+    return float(mask[y0:y1, x0:x1].sum() / max(1, scene.foreground[y0:y1, x0:x1].sum()))
 
 
 def _span(middle: float, reach: float, size: int) -> tuple[int, int]:

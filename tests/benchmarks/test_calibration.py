@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import (
+    KINDS,
+    POSE_SCALES,
     Instance,
     Scene,
     design,
@@ -18,11 +20,13 @@ from benchmarks.calibration import (
     wilson,
     write_constants,
 )
-from stages.perception.doubt import FEATURES, Calibration, Evidence
+from stages.devices.clutter import COUNTS, Pile
+from stages.perception.doubt import FEATURES, RIGHT_METRES, Calibration, Evidence
+from tests.stages.perception.scenes import CATALOGUE
 
 PLAIN = Evidence(
     margin=5.0, fit=0.0015, shown=900.0, visible=1.0, gain=0.9, looked_through=0.0, spread_metres=0.002,
-    spread_radians=0.03, hypothesis=0.5, confidence=1.0,
+    spread_radians=0.03, breadth=0.1, hypothesis=0.5, confidence=1.0,
 )  # fmt: skip
 
 
@@ -32,15 +36,15 @@ def synthetic(count: int, seed: int) -> list[Scene]:
     scenes: list[Scene] = []
     for _ in range(count):
         margin, spread = float(rng.uniform(-2, 8)), float(rng.uniform(0.001, 0.02))
-        evidence = replace(PLAIN, margin=margin, spread_metres=spread)
+        evidence = replace(PLAIN, margin=margin, spread_metres=spread, breadth=spread / RIGHT_METRES)
         right = bool(rng.random() < 1 / (1 + np.exp(-(margin - 100 * spread))))
         instance = Instance(
-            "mug", right, float(abs(rng.normal(0, 2 * spread))), 0.1, dict.fromkeys(("7.0", "20.0", "60.0"), evidence)
+            "mug", right, float(abs(rng.normal(0, 2 * spread))), 0.1, dict.fromkeys(map(str, POSE_SCALES), evidence)
         )
         # The second hypothesis is true as often as a scale of 0.2 says it is.
         deficit = float(rng.uniform(0, 1))
         true = int(rng.random() < 1 / (1 + np.exp(deficit / 0.2)))
-        scenes.append(Scene("noisy", 0, true == 0, true, 10.0, (-5.0, -5.0 - 10.0 * deficit), (instance,)))
+        scenes.append(Scene("low", "noisy", 0, true == 0, true, 10.0, (-5.0, -5.0 - 10.0 * deficit), (instance,)))
     return scenes
 
 
@@ -62,8 +66,8 @@ def test_a_fit_predicts_scenes_that_it_has_not_seen(capsys: pytest.CaptureFixtur
     weights = dict(zip(FEATURES, constants.weights, strict=True))
     assert weights["margin"] > 1 and weights["spread"] < 0
     assert 0.13 < constants.hypothesis_scale < 0.3
-    bins = evaluate(synthetic(800, 2), constants)
-    assert expected_error(bins) < 0.05
+    bins, winners = evaluate(synthetic(800, 2), constants)
+    assert expected_error(bins) < 0.05 and expected_error(winners) < 0.05
     printed = capsys.readouterr().out
     assert "800 objects in 800 estimates" in printed and "the least sure tenth" in printed
 
@@ -93,5 +97,23 @@ def test_constants_come_back_as_they_were_written(tmp_path: Path) -> None:
 
 def test_the_reliability_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib comes with the extra `benchmarks`")
-    plot(reliability(np.array([0.2, 0.9, 0.95]), np.array([False, True, True])), tmp_path / "figures" / "plot.png")
-    assert (tmp_path / "figures" / "plot.png").stat().st_size > 5000
+    bins = reliability(np.array([0.2, 0.9, 0.95]), np.array([False, True, True]))
+    for winners in (bins, []):
+        plot(bins, winners, tmp_path / "figures" / f"{len(winners)}.png")
+    one, two = ((tmp_path / "figures" / f"{count}.png").stat().st_size for count in (0, len(bins)))
+    assert 5000 < one < two
+
+
+def test_a_true_set_that_is_not_among_the_hypotheses_makes_the_winner_less_sure() -> None:
+    scenes = synthetic(200, 6)
+    lost = [replace(scene, winner_right=False, true_hypothesis=-1) if i % 4 == 0 else scene
+            for i, scene in enumerate(scenes)]  # fmt: skip
+    assert fit(lost).hypothesis_scale > 1.1 * fit(scenes).hypothesis_scale
+
+
+def test_every_kind_of_piles_holds_more_doubt_than_clutter_15() -> None:
+    assert KINDS["clutter"].pile == Pile()
+    for name, kind in KINDS.items():
+        assert set(kind.pile.labels) <= set(CATALOGUE.objects)
+        assert name == "clutter" or kind.pile.least_visible < Pile().least_visible
+        assert name == "clutter" or np.mean(kind.pile.counts) > np.mean(COUNTS)

@@ -8,6 +8,7 @@ import pytest
 
 from runner.contract import Refused
 from stages.perception.doubt import (
+    CONSTANTS,
     Calibration,
     Evidence,
     Judge,
@@ -27,9 +28,9 @@ HIDDEN_HANDLE, SHOWN_HANDLE = upright("mug", 0.0, 0.0, np.pi / 2), upright("mug"
 
 PLAUSIBLE = Calibration(
     hypothesis_scale=0.05, pose_scale=40.0, spread_scale=1.0, bias=0.5,
-    weights=(0.6, -0.5, 0.0, 0.5, -0.5, -0.3, 0.3, 0.1),
-    centres=(0.0, -6.3, 7.0, 0.8, 0.0, -1.5, 2.0, 0.8),
-    scales=(1.0, 0.4, 0.8, 0.2, 0.1, 0.8, 2.0, 0.2),
+    weights=(0.6, -0.5, 0.0, 0.5, -0.5, -0.3, 0.3, 0.1, -0.3, -0.3, 0.3),
+    centres=(0.0, -6.3, 7.0, 0.8, 0.0, -1.5, 2.0, 0.8, 0.05, 0.2, 0.8),
+    scales=(1.0, 0.4, 0.8, 0.2, 0.1, 0.8, 2.0, 0.2, 0.1, 0.3, 0.2),
 )  # fmt: skip
 """What tests judge with, whatever was fitted last."""
 
@@ -90,6 +91,29 @@ def test_an_object_that_floats_before_the_readings_is_contradicted() -> None:
     (found,) = assess(seen, lifted).objects
     assert found.contradicted and found.evidence.looked_through > 0.9
     assert found.probability < 0.2
+
+
+def test_an_object_below_the_plane_is_sunk() -> None:
+    seen = render({"tea_box": BOX})
+    down = -0.02 * seen.scene.T_camera_table[:3, 2]
+    (resting,) = assess(seen).objects
+    (sunk,) = assess(seen, {"tea_box": pose(np.eye(3), down) @ seen.poses["tea_box"]}).objects
+    assert resting.evidence.sunk < 0.002 and sunk.evidence.sunk == pytest.approx(0.02, abs=0.002)
+    assert sunk.probability < resting.probability
+
+
+def test_readings_that_nothing_explains_speak_against_the_object_whose_box_holds_them() -> None:
+    seen = render({"tea_box": BOX, "soup_can": upright("soup_can", -0.13, 0.05, 0.3)})
+    judge, T = Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE), seen.poses["tea_box"]
+    box, other = (np.asarray(seen.boxes[label], float) for label in ("tea_box", "soup_can"))
+    own, both, neither = (
+        judge.assess(seen.scene, [Judged("tea_box", T, 0.9, (), given)], np.zeros(1), 0).objects[0]
+        for given in (box, np.concatenate([np.minimum(box, other)[:2], np.maximum(box, other)[2:]]), None)
+    )
+    assert own.evidence.unexplained < 0.02 and own.evidence.agreement > 0.9
+    assert both.evidence.unexplained > 0.1 and both.evidence.agreement < 0.7
+    assert both.probability < own.probability
+    assert (neither.evidence.unexplained, neither.evidence.agreement) == (0.0, 1.0)
 
 
 def test_an_object_that_shows_nothing_is_not_contradicted_but_unsure() -> None:
@@ -170,6 +194,22 @@ def test_better_evidence_is_never_less_sure() -> None:
     before = calibration.probability(evidence.features())
     for change in ({"margin": evidence.margin + 4}, {"gain": evidence.gain + 0.3}, {"looked_through": -0.3}):
         assert calibration.probability(replace(evidence, **change).features()) >= before
+
+
+def test_probabilities_are_probabilities_whatever_the_evidence() -> None:
+    (found,) = assess(render({"tea_box": BOX})).objects
+    calibration, rng = Calibration.load(), np.random.default_rng(0)
+    names = ("margin", "fit", "shown", "gain", "looked_through", "breadth", "sunk", "unexplained", "agreement")
+    for _ in range(200):
+        values = dict(zip(names, (10.0 ** rng.uniform(-6, 6, len(names)) * rng.choice([-1, 1])).tolist(), strict=True))
+        assert 0.0 <= calibration.probability(replace(found.evidence, **values).features()) <= 1.0
+
+
+def test_constants_for_other_features_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CONSTANTS.read_text().replace("weights: [", "weights: [0.5, "))
+    with pytest.raises(Refused, match=r"calibration\.yaml: weights has 12 numbers; there are 11 features"):
+        Calibration.load(path)
 
 
 def test_constants_of_another_form_are_refused(tmp_path: Path) -> None:
