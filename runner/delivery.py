@@ -193,6 +193,12 @@ class Delivery:
                 if edge.route.consumer == process.stage:
                     (edge.appeared if present else edge.vanished)(process.replica)
 
+    def drain(self, stopping: Callable[[], bool]) -> None:
+        """Waits until all that was published has arrived wherever it goes: nothing hangs on this process any more."""
+        with self._changed:
+            while self._held_back and not stopping():
+                self._changed.wait(POLL_SECONDS)
+
     def close(self) -> None:
         """Acts on what has not arrived, too: the graph ends and no step will be run again."""
         with self._changed:

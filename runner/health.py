@@ -65,10 +65,11 @@ class Pulses:
         self.newest: dict[tuple[str, int], Pulse] = {}
         """By (stage, replica); the recorder is ("recorder", 0)."""
 
-    def note(self, payload: bytes) -> None:
-        """Takes a pulse as it came; raises CodecError where it is none."""
+    def note(self, payload: bytes) -> Pulse:
+        """Takes a pulse as it came, and returns it; raises CodecError where it is none."""
         pulse = codec.unpack(Pulse, payload)
         self.newest[pulse.stage, pulse.replica] = pulse
+        return pulse
 
     def of(self, process: Process) -> Pulse | None:
         """The newest of one incarnation."""

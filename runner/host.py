@@ -72,6 +72,7 @@ class Host:
         self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
         self._presence = Presence()
         self._stopping = threading.Event()
+        self._retiring = threading.Event()
         self._delivery = Delivery(assignment.routes, self._bus.publish, self._warn, self._stopping.is_set)
         self._inbox = Inbox(self._node)
         self._executor = Executor(
@@ -109,9 +110,19 @@ class Host:
         self._stopping.set()
         self._deliveries.put(None)
 
+    def retire(self) -> None:
+        """Ends :meth:`run` after the whole present step; a successor does the rest. May be called from a signal
+        handler.
+        """
+        self._retiring.set()
+        self._deliveries.put(None)
+
     def close(self) -> None:
         """Lets the recorder catch up, then releases the stage and the bus."""
-        self._say_what_is_left()
+        if self._retiring.is_set():
+            self._delivery.drain(self._stopping.is_set)
+        else:
+            self._say_what_is_left()
         self._delivery.close()
         self._heart.stop()
         self._bus.flush()
@@ -213,7 +224,7 @@ class Host:
     def _serve(self) -> None:
         """Works off inputs as they come; a source is advanced in between."""
         source = None if self._node.type.source is None else self._advance(self._node.type.source)
-        while not self._stopping.is_set():
+        while not (self._stopping.is_set() or self._retiring.is_set()):
             self._take_all(wait=source is None)
             ready = self._inbox.pop()
             if ready is not None:
@@ -241,12 +252,22 @@ class Host:
                     raise Stopped
         except Stopped:
             record.outcome = "stopped"
+        except Refused as refusal:
+            self._refuse_command(record, ready.handler, refusal)
         except Exception as error:
             record.outcome, record.error = "failed", _summary(error)
             raise
         finally:
             self._present = None
             self._journal(record)
+
+    def _refuse_command(self, record: "_Record", handler: Handler, refusal: Refused) -> None:
+        """What a person called and the stage refuses is done with; any other refusal ends the graph."""
+        record.error = f"Refused: {refusal}"
+        if not handler.is_command:
+            record.outcome = "failed"
+            raise refusal
+        self._log(str(refusal), "warning")
 
     def _advance(self, handler: Handler) -> Iterator[bool]:
         """Sends the next message of the source each time it is advanced; every message is a step."""
@@ -396,6 +417,7 @@ def main() -> int:
         traceback.print_exc()
         return _fail(_summary(error), EXIT_FAILED)
     signal.signal(signal.SIGTERM, lambda *_: host.stop())
+    signal.signal(signal.SIGUSR1, lambda *_: host.retire())
     return _serve(host)
 
 

@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections import defaultdict, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,10 +17,12 @@ import msgspec
 
 from runner import codec
 from runner.bus import RECORDER, Bus, Packet, Presence, Process, free_endpoint
+from runner.calls import CallQuestion, CallRequest, Calls
 from runner.children import ending, last_lines, signal_group, spawn
 from runner.codec import CodecError, Envelope, LogLine, Receipt, Step
-from runner.contract import Finished, Level, Refused, Restarted
+from runner.contract import Finished, Level, Message, Refused, Restarted
 from runner.delivery import Delivery
+from runner.document import suggest
 from runner.graph import FINISHED, SUPERVISOR, Graph, graph_to_json, node_entry
 from runner.health import Pulses
 from runner.host import EXIT_REFUSED, Assignment
@@ -27,7 +30,7 @@ from runner.info import stage_times
 from runner.ports import port_name
 from runner.recorder import Manifest, topic
 from runner.registry import Entry, Registration, runs
-from runner.status import ProcessStatus, RunStatus
+from runner.status import ProcessStatus, Rates, RunStatus, topics_of
 from runner.step import sequence_of
 from runner.terminal import Terminal
 
@@ -37,6 +40,9 @@ RECORDER_GRACE_SECONDS = 2.5
 TICK_SECONDS = 0.05
 SETTLE_SECONDS = 5.0
 """How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
+RETIRE_SECONDS = 30.0
+"""What a process that is asked to restart may take for its present step; a killed step is done again."""
+ASKED = "asked to restart"
 SHOWN_LINES = 8
 EXIT_INCOMPLETE = 3
 
@@ -56,8 +62,14 @@ class _Child:
     log: Path
     started: float = field(default_factory=time.monotonic)
     announced: bool = False
+    ready_after: float = 0.0
+    """Seconds from its start."""
+    crashes: int = 0
+    """How often this process has crashed before, whatever else it was restarted for."""
     restarted_because: str = ""
     """Why its predecessor ended."""
+    retires_by: float | None = None
+    """When it is killed if it has not gone by itself; None where it was not asked to."""
 
     def reason(self) -> str:
         """Why it ended: the signal, or the last thing it printed."""
@@ -118,9 +130,13 @@ class Supervisor:
         self._viewer: _Child | None = None
         self._presence = Presence()
         self._pulses = Pulses()
+        self._rates = Rates()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
-        self._restarts = 0
+        self._numbers: dict[str, int] = defaultdict(int)
+        """Next sequence number by output port of the supervisor."""
+        self._numbering = threading.Lock()
+        self._calls = Calls(graph, self._publish)
         self._absent = set(graph.processes())
 
     def run(self, *, view: bool = False) -> End:
@@ -150,7 +166,9 @@ class Supervisor:
         self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
         self._bus.subscribe("gone/*/*/*", self._on_gone)
         self._bus.subscribe("h/*/*", self._on_pulse)
-        self._bus.serve("status", lambda _: msgspec.json.encode(self._status()))
+        for key in self._calls.answer_keys:
+            self._bus.subscribe(f"m/{key}", self._on_answer)
+        self._serve()
         self._bus.watch(self._on_presence)
 
     def _on_step(self, packet: Packet) -> None:
@@ -160,6 +178,11 @@ class Supervisor:
             self._steps.append(step)
             if step.outcome == "done":
                 self._delivery.acknowledge(step.stage, step.consumed)
+                self._calls.note_step(step)
+
+    def _on_answer(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            self._calls.note_answer(codec.unpack(Envelope, packet.payload).id, packet.payload)
 
     def _on_receipt(self, packet: Packet) -> None:
         with contextlib.suppress(CodecError):
@@ -170,6 +193,7 @@ class Supervisor:
     def _on_log(self, packet: Packet) -> None:
         with contextlib.suppress(CodecError):
             line = codec.unpack(LogLine, packet.payload)
+            self._calls.note_log(line)
             if line.stage != SUPERVISOR and line.level != "debug":
                 self._terminal.show(self._name_of(line.stage, line.replica), line.text, line.level)
 
@@ -186,7 +210,7 @@ class Supervisor:
 
     def _on_pulse(self, packet: Packet) -> None:
         with contextlib.suppress(CodecError):
-            self._pulses.note(packet.payload)
+            self._rates.note(self._pulses.note(packet.payload), packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         self._delivery.update(process, present)
@@ -194,9 +218,9 @@ class Supervisor:
         child = self._children.get((process.stage, process.replica))
         if not present or child is None:
             return
+        child.ready_after = time.monotonic() - child.started
         child.announced = True
-        seconds = time.monotonic() - child.started
-        self._terminal.show(self._name_of(process.stage, process.replica), f"ready after {seconds:.1f} s")
+        self._terminal.show(self._name_of(process.stage, process.replica), f"ready after {child.ready_after:.1f} s")
         self._absent.discard((process.stage, process.replica))
         if not self._absent and not process.incarnation:
             self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
@@ -258,6 +282,8 @@ class Supervisor:
         if self._recorder is not None and self._recorder_died():
             return End(1, f"the recorder {self._recorder.reason()}")
         for child in list(self._children.values()):
+            if child.retires_by is not None and time.monotonic() > child.retires_by:
+                signal_group(child.handle, signal.SIGKILL)
             if child.handle.poll() is not None:
                 end = self._replace(child)
                 if end is not None:
@@ -269,20 +295,28 @@ class Supervisor:
         process, name = child.process, self._name_of(child.process.stage, child.process.replica)
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {child.reason()}")
+        if child.retires_by is not None:
+            self._succeed(child, ASKED, child.crashes)
+            return None
         budget = self._graph.nodes[process.stage].restarts
-        if (process.stage, process.replica) in self._absent or process.incarnation >= budget:
+        if (process.stage, process.replica) in self._absent or child.crashes >= budget:
             when = "at start-up" if (process.stage, process.replica) in self._absent else f"after {budget} restarts"
             self._show_output(child)
             return End(1, f"{name} failed {when}: {child.reason()}")
-        self._say(f"{name} restarts ({process.incarnation + 1} of {budget}): {child.reason()}", "warning")
+        self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {child.reason()}", "warning")
         if child.handle.returncode < 0:
             self._show_output(child)
-        self._publish_restart(process, child.reason())
-        self._settle(child)
-        successor = Process(process.stage, process.replica, process.incarnation + 1)
-        self._children[process.stage, process.replica] = self._start(successor)
-        self._children[process.stage, process.replica].restarted_because = child.reason()
+        self._succeed(child, child.reason(), child.crashes + 1)
         return None
+
+    def _succeed(self, child: _Child, reason: str, crashes: int) -> None:
+        """Puts a new process in the place of one that has gone."""
+        process = child.process
+        self._publish_restart(process, reason)
+        self._settle(child)
+        successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
+        successor.restarted_because, successor.crashes = reason, crashes
+        self._children[process.stage, process.replica] = successor
 
     def _settle(self, child: _Child) -> None:
         """Waits until all that the recorder has of a dead process is known here."""
@@ -293,10 +327,14 @@ class Supervisor:
             time.sleep(TICK_SECONDS / 5)
 
     def _publish_restart(self, process: Process, reason: str) -> None:
-        message = Restarted(stage=process.stage, replica=process.replica, reason=reason)
-        port = port_name(Restarted)
-        own = f"{SUPERVISOR}.{port}#{self._restarts}"
-        self._restarts += 1
+        self._publish(port_name(Restarted), Restarted(stage=process.stage, replica=process.replica, reason=reason))
+
+    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> None:
+        """Sends a message of the supervisor's own; ``say`` is told its id before anybody else."""
+        with self._numbering:
+            own = f"{SUPERVISOR}.{port}#{self._numbers[port]}"
+            self._numbers[port] += 1
+        say(own)
         envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
         payload = codec.pack(envelope)
         self._bus.publish(f"m/{SUPERVISOR}/{port}", payload)
@@ -307,6 +345,7 @@ class Supervisor:
     def _stop(self) -> str:
         """Stops the stages, then the recorder, and returns the recorder's verdict."""
         self._stopping.set()
+        self._calls.close()
         _end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
         last = [child for child in (self._recorder, self._viewer) if child is not None]
         _end_all(last, RECORDER_GRACE_SECONDS)
@@ -323,6 +362,49 @@ class Supervisor:
 
     # ------------------------------------------------------------------------------------------ what is asked
 
+    def _serve(self) -> None:
+        """Answers the live tools."""
+        serve = self._bus.serve
+        serve("status", lambda _: msgspec.json.encode(self._status()))
+        serve("commands", lambda _: msgspec.json.encode(self._calls.types()))
+        serve("call", lambda text: self._call(msgspec.json.decode(text, type=CallRequest)).encode())
+        serve(
+            "progress",
+            lambda text: msgspec.json.encode(self._calls.progress(msgspec.json.decode(text, type=CallQuestion))),
+        )
+        serve("restart", lambda text: self._restart(text.decode()).encode())
+        serve("down", self._down)
+
+    def _down(self, _: bytes) -> bytes:
+        self._events.put(End(0, "ended by runner down"))
+        return b""
+
+    def _call(self, request: CallRequest) -> str:
+        if not self._is_ready():
+            waited_for = sorted(self._name_of(*key) for key in self._absent) or [RECORDER]
+            raise Refused(f"the graph is not ready yet: it waits for {', '.join(waited_for)}")
+        return self._calls.call(request)
+
+    def _restart(self, name: str) -> str:
+        """Asks one process to finish and waits for its successor; returns what to tell the user."""
+        found = {self._name_of(*key): key for key in self._graph.processes()}
+        if name not in found:
+            raise Refused(f"no process {name!r}{suggest(name, found)}")
+        old = self._children.get(found[name])
+        if old is None or not old.announced:
+            raise Refused(f"{name} is not ready yet")
+        old.retires_by = time.monotonic() + RETIRE_SECONDS
+        os.kill(old.handle.pid, signal.SIGUSR1)
+        while (new := self._children[found[name]]) is old or not new.announced:
+            if self._stopping.is_set():
+                raise Refused(f"the graph ended before {name} was back")
+            time.sleep(TICK_SECONDS)
+        return f"{name} is back: process {new.handle.pid}, ready after {new.ready_after:.1f} s"
+
+    def _is_ready(self) -> bool:
+        """Whether everybody is there who must hear what is published, the recorder first."""
+        return not self._absent and self._presence.wait_for([(RECORDER, 0)], lambda: True)
+
     def _status(self) -> RunStatus:
         children = [*filter(None, [self._recorder]), *list(self._children.values())]
         return RunStatus(
@@ -331,22 +413,27 @@ class Supervisor:
             recording=self._entry.recording,
             endpoint=self._endpoint,
             started=self._entry.started,
-            ready=not self._absent,
+            ready=self._is_ready(),
             processes=tuple(map(self._process_status, children)),
+            topics=topics_of(self._graph),
         )
 
     def _process_status(self, child: _Child) -> ProcessStatus:
         process = child.process
-        ended = child.handle.poll() is not None
-        ready = child.announced or process.stage == RECORDER
+        pulse = self._pulses.of(process)
+        state = "starting" if pulse is None or not (child.announced or process.stage == RECORDER) else pulse.state
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
-            replicated=self._name_of(process.stage, process.replica) != process.stage,
-            state="ended" if ended else "ready" if ready else "starting",
+            name=self._name_of(process.stage, process.replica),
+            state=state if child.handle.poll() is None else "ended",
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
+            pulse=pulse,
+            cpu=self._rates.cpu(process.stage, process.replica),
+            steps_per_second=self._rates.steps(process.stage, process.replica),
+            sent=self._rates.sent(process.stage, process.replica),
         )
 
     # ------------------------------------------------------------------------------------------ what is said

@@ -40,8 +40,10 @@ def _check(options: argparse.Namespace) -> int:
     from runner.graph import load_graph
 
     graph = load_graph(options.graph, options.settings)
-    edges = sum(len(node.inputs) for node in graph.nodes.values())
-    print(f"{options.graph}: {len(graph.nodes)} stages, {len(graph.processes())} processes, {edges} edges: good")
+    commands = len(graph.commands())
+    edges = sum(len(node.inputs) for node in graph.nodes.values()) - commands
+    counts = (f"{len(graph.nodes)} stages", f"{len(graph.processes())} processes", f"{edges} edges")
+    print(f"{options.graph}: {', '.join(counts)}{f', {commands} commands' if commands else ''}: good")
     return 0
 
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,33 +15,46 @@ import msgspec
 import pytest
 
 from runner.bus import Bus, free_endpoint
+from runner.calls import CallRequest, Calls, Progress
+from runner.codec import Envelope, open_envelope, unpack
 from runner.contract import Refused
+from runner.graph import load_graph
+from runner.live import Live
+from runner.recording import Recording
 from runner.registry import Entry, Registration, find_run, runs
-from runner.status import RunStatus
-from tests.runner.test_runs import DOUBLES, finish, read_until, start
+from tests.runner.test_runs import DOUBLES, HERE, finish, read_until
+from tests.runner.test_runs import Run as Finished
+from tests.runner.toys import Sum
 
+ACCOUNT = HERE / "account.yaml"
 ENDLESS = ("counter.count=1000000", "counter.period=0.02", "sink.count=1000000")
 
 
-class Live:
-    """A running graph and a bus of a tool that looks at it."""
+class Run:
+    """A running graph and its entry in the list of runs."""
 
-    def __init__(self, folder: Path, graph: Path = DOUBLES, *settings: str) -> None:
+    def __init__(self, folder: Path, graph: Path, *settings: str) -> None:
         self.folder = folder
-        self.process = start(graph, folder, *(settings or ENDLESS))
-        self.printed = read_until(self.process, "processes are ready")
+        changes = [part for setting in settings for part in ("--set", setting)]
+        command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder), *changes]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            self.printed = read_until(self.process, "processes are ready")
+        except AssertionError:
+            self.process.communicate()
+            raise
         self.entry = next(entry for entry in runs() if Path(entry.recording).parent == folder)
 
-    def status(self) -> RunStatus:
-        bus = Bus(self.entry.run, connect=self.entry.endpoint)
-        try:
-            return msgspec.json.decode(bus.ask("status", b"", 20), type=RunStatus)
-        finally:
-            bus.close()
+    def finish(self) -> Finished:
+        return finish(self.process, self.folder, self.printed)
 
     def close(self) -> None:
         self.process.terminate()
-        finish(self.process, self.folder, self.printed)
+        self.finish()
+
+
+def sink(folder: Path) -> str:
+    return f"sink.path={folder / 'out.txt'}"
 
 
 @pytest.fixture(autouse=True)
@@ -46,10 +64,25 @@ def registry(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monke
 
 
 @pytest.fixture
-def live(tmp_path: Path) -> Iterator[Live]:
-    running = Live(tmp_path)
+def doubles(tmp_path: Path) -> Iterator[Run]:
+    """A counter, a doubler and a sink without an end."""
+    running = Run(tmp_path, DOUBLES, sink(tmp_path), *ENDLESS)
     yield running
     running.close()
+
+
+@pytest.fixture
+def account(tmp_path: Path) -> Iterator[Run]:
+    """A stage with commands."""
+    running = Run(tmp_path, ACCOUNT)
+    yield running
+    running.close()
+
+
+def runner(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command as a user types it."""
+    command = [sys.executable, "-m", "runner.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 30) -> None:
@@ -117,23 +150,129 @@ def test_a_folder_that_others_may_enter_is_refused(tmp_path: Path, monkeypatch: 
         runs()
 
 
-def test_a_supervisor_that_was_killed_is_struck_off_the_list(live: Live) -> None:
-    assert [found.run for found in runs()] == [live.entry.run]
-    live.process.kill()
-    live.process.communicate()
+def test_a_supervisor_that_was_killed_is_struck_off_the_list(doubles: Run) -> None:
+    assert [found.run for found in runs()] == [doubles.entry.run]
+    doubles.process.kill()
+    doubles.process.communicate()
     wait_for(lambda: not runs())
 
 
 # ------------------------------------------------------------------------------------------ status
 
 
-def test_a_run_says_how_its_processes_are(live: Live) -> None:
-    status = live.status()
-    assert status.ready
-    assert {process.name: process.state for process in status.processes} == {
-        "recorder": "ready",
-        "counter": "ready",
-        "doubler": "ready",
-        "sink": "ready",
-    }
-    assert status.recording == live.entry.recording
+def test_a_run_says_how_its_processes_are(doubles: Run) -> None:
+    with Live(doubles.entry) as live:
+        live.wait_until_ready()
+        wait_for(lambda: all(process.pulse and process.pulse.sent for process in live.status().processes[1:3]))
+        status = live.status()
+    assert [process.name for process in status.processes] == ["recorder", "counter", "doubler", "sink"]
+    assert {process.state for process in status.processes} <= {"waiting", "working", "held back"}
+    assert status.recording == doubles.entry.recording
+    double = next(topic for topic in status.topics if topic.topic == "doubler/double")
+    assert (double.type, double.consumers) == ("Double", ("sink.double",))
+
+
+# ------------------------------------------------------------------------------------------ commands
+
+
+def call(live: Live, command: str, **arguments: str) -> Progress:
+    """The last news of a call that is followed to its end, with all log lines."""
+    live.wait_until_ready()
+    news = list(live.follow(live.call(CallRequest("account", command, arguments))))
+    return msgspec.structs.replace(news[-1], lines=tuple(line for one in news for line in one.lines))
+
+
+def test_a_stage_does_what_is_called(account: Run) -> None:
+    with Live(account.entry) as live:
+        assert call(live, "add", amount="5", note="from me").lines == (("info", "5 added from me"),)
+        added = call(live, "add", amount="-2")
+        assert added.emitted == ("account.sum#1",)
+        assert call(live, "add", amount="0").refused == "amount=0: nothing to add; valid: any other number"
+        collected = call(live, "collect", count="3")
+        answer = open_envelope(Sum, unpack(Envelope, collected.answer))
+        assert (answer.total, answer.calls) == (6, 2)
+        live.down()
+    finished = account.finish()
+    assert finished.code == 0, finished.output
+    recording = Recording(finished.recording)
+    assert recording.verdict.complete
+    assert recording.envelope("supervisor.account_add#1").type == "Add"
+    replayed = runner("replay", str(finished.recording), "--verify")
+    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+
+
+@pytest.mark.parametrize(
+    ("stage", "command", "arguments", "reason"),
+    [
+        ("acount", "add", {}, "no stage 'acount'; did you mean 'account'? valid: account, counter"),
+        ("account", "ad", {}, "account has no command 'ad'; did you mean 'add'? valid: add, collect"),
+        ("account", "add", {}, "account add: needs amount=..."),
+        (
+            "account",
+            "add",
+            {"amout": "1"},
+            "account add: no field 'amout'; did you mean 'amount'",
+        ),
+        ("account", "add", {"amount": "much"}, "account add: amount=much: Expected `int`, got `str`; valid: int"),
+        (
+            "account",
+            "add",
+            {"amount": "1", "mood": "mad"},
+            "account add: mood=mad: .*; valid: glad | sad",
+        ),
+    ],
+)
+def test_what_breaks_the_type_of_a_command_is_refused(
+    stage: str, command: str, arguments: dict[str, str], reason: str
+) -> None:
+    published: list[str] = []
+    calls = Calls(load_graph(ACCOUNT), lambda port, *_: published.append(port))
+    with pytest.raises(Refused, match=reason.replace("?", r"\?").replace("|", r"\|")):
+        calls.call(CallRequest(stage, command, arguments))
+    assert published == []
+
+
+def test_commands_describe_themselves() -> None:
+    add, collect = Calls(load_graph(ACCOUNT), lambda *_: None).types()
+    assert (add.stage, add.name, add.text, add.answer) == ("account", "add", "Adds to the account.", None)
+    assert [(one.name, one.type, one.default, one.text) for one in add.fields] == [
+        ("amount", "int", None, "May be negative."),
+        ("mood", "glad | sad", "'glad'", ""),
+        ("note", "str", "''", ""),
+    ]
+    assert collect.answer == "sum"
+
+
+def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> None:
+    with Live(account.entry) as live:
+        pid = next(process.pid for process in live.status().processes if process.stage == "account")
+        os.kill(pid, signal.SIGKILL)
+        assert call(live, "add", amount="5").lines == (("info", "5 added"),)
+
+
+# ------------------------------------------------------------------------------------------ restart
+
+
+def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) -> None:
+    run = Run(
+        tmp_path,
+        DOUBLES,
+        sink(tmp_path),
+        "counter.count=100",
+        "counter.period=0.03",
+        "sink.count=100",
+        "doubler.restarts=0",
+    )
+    with Live(run.entry) as live:
+        with pytest.raises(Refused, match=r"no process 'dubler'; did you mean 'doubler'"):
+            live.restart("dubler")
+        wait_for((tmp_path / "out.txt").exists)
+        assert re.fullmatch(r"doubler is back: process \d+, ready after \d+\.\d s", live.restart("doubler"))
+        doubler = next(process for process in live.status().processes if process.stage == "doubler")
+        assert (doubler.restarts, doubler.reason) == (1, "asked to restart")
+    finished = run.finish()
+    assert finished.code == 0, finished.output
+    assert finished.result == [str(2 * value) for value in range(100)]
+    steps = [step for step in Recording(finished.recording).steps if step.stage == "doubler"]
+    assert {step.outcome for step in steps} == {"done"}
+    assert {step.incarnation for step in steps} == {0, 1}
