@@ -7,7 +7,6 @@ its interval is a bootstrap over images, because the objects of an image are not
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.accuracy import Score, score
+from benchmarks.command import command
 from benchmarks.datasets import detections_file, images
 from benchmarks.estimate import Settings, estimates, results
 from runner.contract import Refused
@@ -137,14 +137,16 @@ def heading(objects: int) -> str:
     return f"{objects} objects, 95 % intervals in brackets\n\n{line}\n|" + "---|" * len(titles)
 
 
+@command
 def main() -> int:
-    """Prints the table; exits 2 where an input is refused."""
+    """Prints the table."""
     options = _options()
-    try:
-        return _run(options)
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    sources = [Source.parsed(text) for text in options.datasets]
+    default = run(DEFAULT, sources, limit=options.images, processes=options.processes)
+    print(heading(default.objects), row(default, default), sep="\n", flush=True)
+    for name in chosen(options.only):
+        print(row(run(name, sources, limit=options.images, processes=options.processes), default), flush=True)
+    return 0
 
 
 def _options() -> argparse.Namespace:
@@ -154,15 +156,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", action="append", default=[], metavar="NAME", help="only these variants")
     parser.add_argument("--processes", type=int, default=2)
     return parser.parse_args()
-
-
-def _run(options: argparse.Namespace) -> int:
-    sources = [Source.parsed(text) for text in options.datasets]
-    default = run(DEFAULT, sources, limit=options.images, processes=options.processes)
-    print(heading(default.objects), row(default, default), sep="\n", flush=True)
-    for name in chosen(options.only):
-        print(row(run(name, sources, limit=options.images, processes=options.processes), default), flush=True)
-    return 0
 
 
 def chosen(only: Sequence[str]) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
+from benchmarks.command import command
 from benchmarks.datasets import ImageId, Truth, read_truth
-from runner.contract import Refused
 from stages.devices.bop import read_dataset
 from stages.devices.bop_results import Result, read_results
 from stages.messages.arrays import Depth, Intrinsics
@@ -235,20 +234,17 @@ def read_views(dataset: Path) -> Views:
     return {(image.scene_id, image.image_id): (image.read()[1], image.K) for image in read_dataset(dataset)}
 
 
+@command
 def main() -> int:
-    """Prints the table; exits 2 where an input is refused."""
+    """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path, help="BOP data set folder")
     parser.add_argument("csv", type=Path, help="results in BOP format")
     parser.add_argument("--json", action="store_true", help="prints JSON instead of a table")
     arguments = parser.parse_args()
-    try:
-        catalogue = Catalogue.load(arguments.dataset / "models")
-        truths, results = read_truth(arguments.dataset), read_results(arguments.csv)
-        scores = score(truths, results, catalogue, read_views(arguments.dataset))
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    catalogue = Catalogue.load(arguments.dataset / "models")
+    truths, results = read_truth(arguments.dataset), read_results(arguments.csv)
+    scores = score(truths, results, catalogue, read_views(arguments.dataset))
     sets = right_sets(truths, results)
     if arguments.json:
         print(json.dumps(as_json(scores, sets), indent=1))

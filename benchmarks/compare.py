@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.command import command as refusing
 from benchmarks.datasets import detections_file, images, parse_wanted
 from benchmarks.figures import Scored, draw, markdown
 from runner.children import SINGLE_THREADED
@@ -41,15 +42,11 @@ def command(method: str, options: argparse.Namespace, out: Path) -> list[str]:
     return [*run, "--dof", str(options.dof), *images_wanted]
 
 
+@refusing
 def main() -> int:
-    """Runs, draws and prints; exits 2 where an input is refused and 1 where a method fails."""
+    """Runs, draws and prints; exits 1 where a method fails."""
     options = _options()
-    try:
-        methods = _methods(options.methods)
-        return _compare(methods, options)
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    return _compare(_methods(options.methods), options)
 
 
 def _options() -> argparse.Namespace:

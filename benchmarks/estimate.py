@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.accuracy import failures, right_sets, score, table
+from benchmarks.command import command
 from benchmarks.datasets import Image, ImageId, detections_file, images, parse_wanted
 from benchmarks.pipeline import Done, Estimate, Pipeline, Step, Steps
 from runner.children import SINGLE_THREADED
@@ -156,14 +156,10 @@ def results(estimate: Estimate, catalogue: Catalogue) -> list[Result]:
     return [Result.of(scene, item, catalogue[item.label].label, estimate.seconds) for item in scene.objects]
 
 
+@command
 def main() -> int:
-    """Estimates, writes, prints the table; exits 2 where an input is refused."""
-    options = _options()
-    try:
-        return _run(options)
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    """Estimates, writes, prints the table."""
+    return _run(_options())
 
 
 def _options() -> argparse.Namespace:

@@ -6,7 +6,6 @@ A row for each object that is not within 2 cm and 15 degrees: what was observed,
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from PIL import Image as Picture
 from PIL import ImageDraw
 
 from benchmarks.accuracy import Score, described, failed, score
+from benchmarks.command import command
 from benchmarks.datasets import Image, detections_file, images
-from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
 from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, Floats
@@ -138,18 +137,15 @@ def sheet(dataset: Path, csv: Path) -> tuple[Picture.Image, int]:
     return Sheet(catalogue).draw(wrong, results), len(wrong)
 
 
+@command
 def main() -> int:
-    """Draws the sheet; exits 2 where an input is refused."""
+    """Draws the sheet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, help="BOP data set folder")
     parser.add_argument("csv", type=Path, help="results in BOP format")
     parser.add_argument("out", type=Path, help="PNG")
     options = parser.parse_args()
-    try:
-        picture, count = sheet(options.dataset, options.csv)
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    picture, count = sheet(options.dataset, options.csv)
     picture.save(options.out)
     print(f"{count} objects are not within 2 cm and 15 degrees: {options.out}")
     return 0

@@ -6,7 +6,6 @@ Accuracy against the allowed rotation error, one panel for each position bound.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy import BOUNDS, Score, interval, recalls, right_sets, score
+from benchmarks.command import command
 from benchmarks.datasets import Image, Truth, detections_file, images
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
@@ -147,18 +147,15 @@ def _seconds(results: Sequence[Result]) -> str:
     return f"{np.mean(list(times.values())):.1f} (at most {max(times.values()):.1f})"
 
 
+@command
 def main() -> int:
-    """Draws the figure and prints the table; exits 2 where an input is refused."""
+    """Draws the figure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="PNG")
     parser.add_argument("dataset", type=Path, help="BOP data set folder")
     parser.add_argument("methods", nargs="+", metavar="NAME=CSV", help="results in BOP format")
     options = parser.parse_args()
-    try:
-        print(_drawn(options.out, options.dataset, dict(_named(text) for text in options.methods)))
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    print(_drawn(options.out, options.dataset, dict(_named(text) for text in options.methods)))
     return 0
 
 

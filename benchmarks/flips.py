@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy import Score, score
+from benchmarks.command import command
 from benchmarks.datasets import Image, Truth, detections_file, images
 from benchmarks.estimate import Settings, estimates
 from runner.contract import Level
@@ -302,7 +303,8 @@ def _found(name: str, data: Path, count: int) -> tuple[Catalogue, list[Case]]:
     return Catalogue.load(data / name / "models"), list(cases(data / name, dof))
 
 
-def main() -> None:
+@command
+def main() -> int:
     """Prints the table and writes the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sets", nargs="*", default=list(SETS), help=f"of {', '.join(SETS)}")
@@ -323,7 +325,8 @@ def main() -> None:
     print(table(rows))
     if shown:
         _write(options.figure, sheet(shown[:_PAIRS], catalogues[:_PAIRS]))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

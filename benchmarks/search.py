@@ -17,9 +17,9 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from benchmarks.command import command
 from benchmarks.datasets import Image, detections_file, images
 from runner.children import SINGLE_THREADED
-from runner.contract import Refused
 from stages.perception.combinations import cheapest, ordered
 from stages.perception.composition import FirstLook
 from stages.perception.likelihood import ObservedScene
@@ -149,14 +149,11 @@ def line(image: Image, way: Way, one: Outcome, plain: Outcome) -> str:
     )
 
 
+@command
 def main() -> int:
-    """Prints the table; exits 1 where a way finds another winner, 2 where an input is refused."""
+    """Prints the table; exits 1 where a way finds another winner."""
     options = _options()
-    try:
-        chosen = chosen_images(options.dataset, options.candidates, options.images)
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    chosen = chosen_images(options.dataset, options.candidates, options.images)
     if not chosen:
         print(f"{options.dataset}: no image has {options.candidates} candidates", file=sys.stderr)
         return 2

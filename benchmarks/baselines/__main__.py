@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.accuracy import failures, right_sets, score, table
 from benchmarks.baselines import METHODS
+from benchmarks.command import command
 from benchmarks.datasets import Image, detections_file, images, parse_ids
-from runner.contract import Refused
 from stages.devices.bop_results import HEADER, Result
 from stages.scene.catalogue import Catalogue
 
 
+@command
 def main() -> int:
-    """Estimates, writes, prints the table; exits 2 where an input is refused."""
-    try:
-        return _run(_options())
-    except Refused as refusal:
-        print(refusal, file=sys.stderr)
-        return 2
+    """Estimates, writes, prints the table."""
+    return _run(_options())
 
 
 def _options() -> argparse.Namespace:
