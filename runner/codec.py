@@ -42,7 +42,9 @@ class CodecError(Exception):
         super().__init__(f"{type_name}{'.' if field else ''}{field}: {reason}")
 
 
-MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#\d+$")]
+MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$")]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
 class Envelope(msgspec.Struct, frozen=True):
@@ -52,8 +54,8 @@ class Envelope(msgspec.Struct, frozen=True):
     """``stage.port#sequence``."""
     lineage: MessageId
     """Id of the message at the root of everything this one hangs on."""
-    time_ns: Annotated[int, msgspec.Meta(ge=0)]
-    """Logical time in nanoseconds."""
+    time_ns: Nanoseconds
+    """Logical time."""
     type: str
     """Class name of the message."""
     version: int
@@ -66,18 +68,18 @@ class Step(msgspec.Struct, frozen=True):
     """One journalled step of one stage: what it consumed and emitted, in which order, and how long it took."""
 
     stage: str
-    replica: int
-    incarnation: int
+    replica: Count
+    incarnation: Count
     """0 for the first process of this replica, one more after each restart."""
-    number: int
+    number: Count
     """Counts the steps of one process from 0."""
     handler: str
-    consumed: tuple[tuple[str, str], ...]
+    consumed: tuple[tuple[str, MessageId], ...]
     """(port, message id) in the order of the handler's parameters; a gather's parts by index."""
-    emitted: tuple[str, ...]
+    emitted: tuple[MessageId, ...]
     """Ids in the order of emission."""
-    time_ns: int
-    """Logical time of the step in nanoseconds."""
+    time_ns: Nanoseconds
+    """Logical time of the step."""
     waited_ns: int
     """From the arrival of the last input to the start of the handler."""
     travelled_ns: int
@@ -92,7 +94,7 @@ class Receipt(msgspec.Struct, frozen=True):
     """What a consumer says of one message (port, id) as it arrives, before it is worked on."""
 
     port: str
-    id: str
+    id: MessageId
     consumed: bool = False
     """True for one that arrived again after it had been consumed."""
 
@@ -104,7 +106,7 @@ class LogLine(msgspec.Struct, frozen=True):
     replica: int
     level: Level
     text: str
-    time_ns: int
+    time_ns: Nanoseconds
     """Wall clock, nanoseconds since the epoch."""
 
 
@@ -334,9 +336,11 @@ def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: t
 
 
 def open_envelope(kind: type[M], sealed: Envelope) -> M:
-    """The message inside, which must be of the given class."""
+    """The message inside, which must be of the given class and version."""
     if sealed.type != kind.__name__:
         raise CodecError("Envelope", "type", f"expected {kind.__name__}, got {sealed.type[:60]!r}")
+    if sealed.version != kind.version:
+        raise CodecError("Envelope", "version", f"expected {kind.__name__} {kind.version}, got {sealed.version}")
     return decode(kind, sealed.body)
 
 
