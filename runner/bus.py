@@ -9,7 +9,7 @@
 ``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
 ``RUN/l/STAGE``                            log lines (LogLine)
 ``RUN/h/STAGE/REPLICA``                    a sign of life twice a second (Pulse); not recorded
-``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers
+``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers; ends with /BADGE
 ``RUN/flush``                              query answered by the recorder once it has everything sent before
 ``RUN/q/NAME``                             question to the supervisor (status, down, restart, call), answered in JSON
 =========================================  ====================================================================
@@ -94,7 +94,7 @@ class Packet:
     """Monotonic clock of this machine when it was sent; 0 where the sender did not say or has another clock."""
     arrived_ns: int
     genuine: bool = True
-    """Whether it comes from a process of this run: see :func:`_badge`."""
+    """Whether it comes from a process of this run, see :func:`_badge`."""
 
 
 _SENT = struct.Struct("<qQ8s")
@@ -171,7 +171,7 @@ class Bus:
 
     def announce(self, process: Process) -> None:
         """Declares this process present, until it closes or dies."""
-        self._declared.append(self._session.liveliness().declare_token(f"{self._run}/present/{process.path}"))
+        self._declared.append(self._session.liveliness().declare_token(self._token(process)))
 
     def watch(
         self, callback: Callable[[Process, bool], None], refuse: Callable[[str, Exception], None] = lambda *_: None
@@ -184,7 +184,9 @@ class Bus:
         def receive(sample: zenoh.Sample, _: int) -> None:
             key = str(sample.key_expr)
             try:
-                process = Process.of(key)
+                process = Process.of(key.rpartition("/")[0])
+                if key != self._token(process):
+                    raise Refused("no process of this run")
             except Refused as refusal:
                 refuse(key.removeprefix(f"{self._run}/"), refusal)
             else:
@@ -194,6 +196,10 @@ class Bus:
             f"{self._run}/present/**", self._in_turn(receive), history=True
         )
         self._declared.append(subscriber)
+
+    def _token(self, process: Process) -> str:
+        path = f"present/{process.path}"
+        return f"{self._run}/{path}/{_badge(self._secret, path).hex()}"
 
     def answer_flush(self) -> None:
         """Lets the others wait for the recorder: its answer follows everything they sent to it."""
