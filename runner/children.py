@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Protocol
 
 TAIL_BYTES = 4096
 SINGLE_THREADED = dict.fromkeys(
@@ -77,8 +78,19 @@ def bound(command: list[str]) -> list[str]:
     return [sys.executable, __file__, str(os.getpid()), *command]
 
 
-def signal_group(child: subprocess.Popen[bytes], signum: signal.Signals) -> None:
+class Elsewhere(Protocol):
+    """A process on another host."""
+
+    def signal_group(self, signum: int) -> None:
+        """Has it signalled with everything it started."""
+        ...
+
+
+def signal_group(child: subprocess.Popen[bytes] | Elsewhere, signum: signal.Signals) -> None:
     """Signals a child and everything it started; one that has gone is no error."""
+    if not isinstance(child, subprocess.Popen):
+        child.signal_group(signum)
+        return
     try:
         os.killpg(child.pid, signum)
     except ProcessLookupError:

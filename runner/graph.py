@@ -195,6 +195,11 @@ class Graph:
         placement = self.nodes[stage].placement
         return placement[replica] if placement else self.layout.head.name
 
+    def hosts_of_stages(self) -> dict[str, set[str]]:
+        """The machines on which each stage has processes."""
+        head = {self.layout.head.name}
+        return {node.name: set(node.placement) or head for node in self.nodes.values()}
+
     def here(self) -> "Graph":
         """The same graph with every process on the machine that starts it."""
         nodes = {name: replace(node, placement=()) for name, node in self.nodes.items()}

@@ -15,7 +15,6 @@ import contextlib
 import datetime
 import ipaddress
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -26,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.contract import Refused
-from runner.network import TOOLS, Credentials
+from runner.network import Credentials
 
 Extension = tuple[x509.ExtensionType, bool]
 """What a certificate says beside names and dates, and whether who does not understand it must refuse."""
@@ -207,8 +206,3 @@ def _read_key(path: Path) -> ec.EllipticCurvePrivateKey:
 def _hint(path: Path) -> str:
     name = path.parent.name
     return f"; make keys with `runner keys init`, and copy the folder {name} to the machine that is {name}"
-
-
-def owners_of(hosts: Mapping[str, str]) -> list[Owner]:
-    """Whom keys are made for: every host and the live tools."""
-    return [*(Owner(name, address) for name, address in hosts.items()), Owner(TOOLS, "")]

@@ -25,11 +25,9 @@ from runner.contract import Refused
 from runner.document import Document, suggest
 
 LOOPBACK = "127.0.0.1"
-TOOLS = "tools"
-"""Common name of the credential that may watch and ask, for live tools on a machine that is no host."""
 ROUTER = "router"
 """Common name of a router that is none of the hosts."""
-RESERVED = (TOOLS, ROUTER, "ca")
+RESERVED = (ROUTER, "ca")
 
 
 class Credentials(msgspec.Struct, frozen=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
@@ -12,6 +11,7 @@ import msgspec
 
 from runner.container import hold, is_being_written
 from runner.contract import Refused
+from runner.network import Network
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -27,8 +27,8 @@ class Entry(msgspec.Struct, frozen=True):
     """Path of the file that is being written."""
     started: float
     """Seconds since the epoch."""
-    credentials: Mapping[str, str] = {}
-    """Paths of what the run's network asks of its peers, by setting; empty on loopback."""
+    network: Network | None = None
+    """What the run's network asks of its peers; None on loopback."""
 
 
 class Registration:

@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
-from runner.network import TOOLS, Credentials, Network
+from runner.network import Credentials, Network
 
-IN, OUT = ("ingress",), ("egress",)
 EVERYTHING = (
     *("put", "delete", "declare_subscriber"),
     *("query", "reply", "declare_queryable"),
     *("liveliness_token", "declare_liveliness_subscriber", "liveliness_query"),
 )
-ASKING = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-"""What one who only watches sends."""
-ANSWERING = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
-"""What one who only watches gets."""
+ORDERS = "hosts/*/order/**"
+"""Keys on which the head has processes started."""
 
 
 def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     """Settings of a Zenoh session, by key.
 
-    Whoever shows no certificate of the graph's authority is not let in. Whoever is let in and is none of the hosts
-    gets and sends nothing, but for the live tools, which watch and ask. Only the head has processes started.
+    Whoever shows no certificate of the graph's authority is not let in. Whoever is let in and is none of the graph's
+    hosts gets and sends nothing. Only the head has processes started.
     """
     others = [name for name in network.hosts if name != network.head]
-    subjects = {"hosts": list(network.hosts), "others": [*others, TOOLS], "tools": [TOOLS]}
     rules = [
-        _rule("take part", "allow", EVERYTHING, (*IN, *OUT)),
-        _rule("ask", "allow", ASKING, IN),
-        _rule("be answered", "allow", ANSWERING, OUT),
-        _rule("order", "deny", ("put",), IN, keys=("hosts/*/order/**",)),
-        _rule("join", "deny", ("query",), IN, keys=("hosts/*/q/join",)),
+        _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
+        _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
     ]
-    policies = {"hosts": ["take part"], "tools": ["ask", "be answered", "join"], "others": ["order"]}
+    subjects = {"hosts": list(network.hosts), **({"others": others} if others else {})}
+    policies = {"hosts": "take part", "others": "give orders"}
     return {
         "transport/link/tls": _tls(credentials),
         "access_control": {
@@ -42,7 +35,7 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
             "default_permission": "deny",
             "rules": rules,
             "subjects": [{"id": name, "cert_common_names": names} for name, names in subjects.items()],
-            "policies": [{"rules": allowed, "subjects": [name]} for name, allowed in policies.items()],
+            "policies": [{"rules": [policies[name]], "subjects": [name]} for name in subjects],
         },
     }
 
@@ -60,13 +53,6 @@ def _tls(credentials: Credentials) -> dict[str, Any]:
     }
 
 
-def _rule(
-    name: str, permission: str, messages: Iterable[str], flows: Iterable[str], keys: tuple[str, ...] = ("**",)
-) -> dict[str, Any]:
-    return {
-        "id": name,
-        "permission": permission,
-        "messages": list(messages),
-        "flows": list(flows),
-        "key_exprs": list(keys),
-    }
+def _rule(name: str, permission: str, messages: tuple[str, ...], flows: tuple[str, ...], keys: str) -> dict[str, Any]:
+    rule = {"id": name, "permission": permission, "messages": list(messages), "flows": list(flows)}
+    return {**rule, "key_exprs": [keys]}

@@ -12,6 +12,9 @@ def add_commands(commands: Commands) -> None:
     up = add(commands, "up", _up, "run a graph, record it, and exit as it ends")
     add_graph(up)
     up.add_argument("--seed", type=int, help="root of all random numbers (short for --set seed=N)")
+    where = up.add_mutually_exclusive_group()
+    where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
+    where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
     up.add_argument("--view", action="store_true", help="open the viewer")
     up.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go")
     add_graph(add(commands, "check", _check, "check a graph file: keys, settings, classes and every edge's type"))
@@ -26,12 +29,44 @@ def _up(options: argparse.Namespace) -> int:
 
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     settings = (*options.settings, *seed)
-    graph = load_graph(options.graph, settings)
+    host = None if options.here else _chosen_host(options.graph, settings, options.host)
     terminal = Terminal()
+    if host is not None:
+        return _take_part(options, settings, host)
+    graph = load_graph(options.graph, settings)
+    graph = graph.here() if options.here else graph
     supervisor = Supervisor(
         graph, file=options.graph, recordings=options.recordings, settings=settings, terminal=terminal
     )
     end = supervisor.run(view=options.view)
+    terminal.plain(end.reason)
+    return end.code
+
+
+def _chosen_host(file: Path, settings: tuple[str, ...], name: str | None) -> str | None:
+    """The host that this machine is, None where it has the supervisor; raises Refused where that is not clear."""
+    from runner.document import read_document
+    from runner.network import choose_host, read_layout
+
+    document = read_document(file)
+    for setting in settings:
+        document.set(setting)
+    layout = read_layout(document)
+    chosen = choose_host(layout, name, file)
+    return None if not layout.hosts or chosen == layout.head.name else chosen
+
+
+def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str) -> int:
+    from runner.agent import Agent, refuse_settings
+    from runner.document import read_document
+    from runner.terminal import Terminal
+
+    document = read_document(options.graph)
+    refuse_settings(settings, host)
+    for setting in settings:
+        document.set(setting)
+    terminal = Terminal()
+    end = Agent(document, host, recordings=options.recordings, terminal=terminal).run()
     terminal.plain(end.reason)
     return end.code
 
