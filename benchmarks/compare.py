@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.command import command as refusing
 from benchmarks.datasets import detections_file, images, parse_wanted
-from benchmarks.figures import Scored, draw, markdown
+from benchmarks.figures import Scored, behind, draw, markdown
 from runner.children import SINGLE_THREADED
 from runner.contract import Refused
 
@@ -84,7 +84,7 @@ def _compare(methods: Sequence[str], options: argparse.Namespace) -> int:
     kind = boxes.stem.removeprefix("detections_")
     objects = sum(image.n_objects for image in chosen)
     draw(folder / "accuracy.png", f"{name}, {kind} boxes: {objects} objects in {len(chosen)} images", scored.methods)
-    text = markdown(scored)
+    text = f"{markdown(scored)}\n\n{behind(scored.methods)}"
     (folder / "accuracy.md").write_text(text + "\n")
     print(text)
     return 0

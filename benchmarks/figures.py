@@ -127,6 +127,21 @@ def markdown(scored: Scored) -> str:
     return "\n".join(lines)
 
 
+def behind(methods: Mapping[str, Sequence[Score]]) -> str:
+    """Where another method has more objects than the first: at each position bound, of the whole degrees."""
+    name, *others = methods
+    lines = [
+        f"{other} is ahead of {name} within {100 * metres:.0f} cm and {degrees} degrees: {theirs} objects against {own}"
+        for metres in POSITION_BOUNDS
+        for degrees in range(1, 181)
+        for own in [sum(one.within(metres, degrees) for one in methods[name])]
+        for other in others
+        for theirs in [sum(one.within(metres, degrees) for one in methods[other])]
+        if theirs > own
+    ]
+    return "\n".join(lines) or f"No method is ahead of {name} at any bound of the figure (each whole degree)."
+
+
 def _share(hits: int, count: int) -> str:
     low, high = interval(hits, count)
     return f"{100 * hits / max(1, count):.1f} ({100 * low:.0f} to {100 * high:.0f})"
@@ -170,7 +185,7 @@ def _drawn(out: Path, dataset: Path, files: Mapping[str, Path]) -> str:
     chosen = list(images(dataset, detections_file(dataset, "exact")))
     scored = Scored.of(dataset, chosen, files)
     draw(out, f"{dataset.resolve().name}: {len(scored.truths)} objects in {len(chosen)} images", scored.methods)
-    return markdown(scored)
+    return f"{markdown(scored)}\n\n{behind(scored.methods)}"
 
 
 if __name__ == "__main__":

@@ -42,7 +42,8 @@ def test_the_figure_has_four_panels_and_the_table_a_row_for_each_method(
     assert figures.main() == 0
     with Image.open(out) as image:
         assert image.size == (1100, 836)
-    head, _, good, bad = capsys.readouterr().out.strip().splitlines()
+    head, _, good, bad, _, verdict = capsys.readouterr().out.strip().splitlines()
+    assert verdict.startswith("No method is ahead of good")
     assert "| 1 cm and 10 degrees |" in head and "| VSD recall |" in head
     assert good.startswith("| good | 100.0 (") and "0.5 (at most 0.5) |" in good
     assert "60.0 (" in bad and "1 of 1" in bad
@@ -52,6 +53,14 @@ def test_curves_count_the_objects_within_both_bounds() -> None:
     truth = Truth((1, 0), 1, np.eye(4))
     scores = [Score(truth, metres=0.004, radians=np.deg2rad(8)), Score(truth, metres=0.03, radians=0.01), Score(truth)]
     assert [sum(one.within(metres, 10) for one in scores) for metres in figures.POSITION_BOUNDS] == [1, 2, 2, 2]
+
+
+def test_bounds_at_which_another_method_is_ahead_are_named() -> None:
+    truth = Truth((1, 0), 1, np.eye(4))
+    near, nearer = (Score(truth, metres=0.004, radians=np.deg2rad(angle)) for angle in (2.5, 1.5))
+    lines = figures.behind({"ours": [near], "theirs": [nearer]}).splitlines()
+    assert lines[0] == "theirs is ahead of ours within 1 cm and 2 degrees: 1 objects against 0"
+    assert len(lines) == len(figures.POSITION_BOUNDS)
 
 
 def test_failures_are_drawn_with_observation_estimate_and_truth(dataset: Path) -> None:
