@@ -39,7 +39,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import zenoh
 from zenoh.handlers import Callback
@@ -47,13 +47,18 @@ from zenoh.handlers import Callback
 from runner.contract import Refused
 from runner.network import Network
 from runner.security import security
+from runner.shared_memory import FROM_BYTES, SharedMemory
 
 A = TypeVar("A")
+Payload = bytes | zenoh.ZBytes
+"""What is sent: plain, or in shared memory."""
 
 LEASE_MS = 5000
 """A host of which nothing is heard for so long is cut off."""
 BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
+REST_SECONDS = 0.001
+"""How long callbacks wait for others to be called with."""
 FLUSH_SECONDS = 1.0
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
@@ -128,7 +133,12 @@ class Bus:
     """
 
     def __init__(
-        self, run: str, *, listen: str | None = None, connect: str | None = None, network: Network | None = None,
+        self,
+        run: str,
+        *,
+        listen: str | None = None,
+        connect: str | None = None,
+        network: Network | None = None,
         secret: str = "",
     ):
         """``connect`` is called first; without a ``network`` all of it stays on loopback.
@@ -142,11 +152,17 @@ class Bus:
         self._session = _open(_config(listen, connect, network))
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._memory = SharedMemory()
         self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
         self._caller.start()
 
-    def publish(self, path: str, payload: bytes) -> None:
+    def load(self, head: bytes, body: bytes) -> Payload:
+        """Head and body as one payload for :meth:`publish`: in shared memory where it is large."""
+        large = len(head) + len(body) >= FROM_BYTES
+        return (self._memory.place((head, body)) if large else None) or head + body
+
+    def publish(self, path: str, payload: Payload) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run."""
         publisher = self._publishers.get(path)
         if publisher is None:
@@ -158,16 +174,39 @@ class Bus:
             self._publishers[path] = publisher
         publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path)))
 
-    def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
-        """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed)."""
+    def offer(self, path: str, payload: bytes) -> None:
+        """Sends to whoever listens, and to nobody who would have to be waited for."""
+        publisher = self._publishers.get(path)
+        if publisher is None:
+            publisher = self._session.declare_publisher(
+                f"{self._run}/{path}",
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+            self._publishers[path] = publisher
+        if cast("Any", publisher).matching_status.matching:
+            publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path)))
 
-        def receive(sample: zenoh.Sample, arrived_ns: int) -> None:
-            key = str(sample.key_expr).removeprefix(f"{self._run}/")
-            sent_ns, badge = _attached(sample)
+    def subscribe(
+        self, path: str, callback: Callable[[Packet], None], *, first: Callable[[Packet], None] | None = None
+    ) -> None:
+        """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed).
+
+        ``first`` is called before, on the link's own thread: it may only hand the packet on.
+        """
+        skipped = len(self._run) + 1
+
+        def receive(sample: zenoh.Sample) -> None:
+            arrived_ns = time.monotonic_ns()
+            key, (sent_ns, badge) = str(sample.key_expr)[skipped:], _attached(sample)
             genuine = badge == _badge(self._secret, key)
-            callback(Packet(key, sample.payload.to_bytes(), sent_ns, arrived_ns, genuine))
+            packet = Packet(key, sample.payload.to_bytes(), sent_ns, arrived_ns, genuine)
+            if first is not None:
+                first(packet)
+            self._calls.put(lambda: callback(packet))
 
-        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", self._in_turn(receive)))
+        receiver = Callback(receive, indirect=False)
+        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", receiver))
 
     def announce(self, process: Process) -> None:
         """Declares this process present, until it closes or dies."""
@@ -263,7 +302,13 @@ class Bus:
         """What a callback raises ends the process, with the traceback: it cannot go on half deaf."""
         try:
             while (call := self._calls.get()) is not None:
+                # What has come with it goes to a handler first: two threads at once would share the interpreter.
+                time.sleep(REST_SECONDS)
                 call()
+                for _ in range(self._calls.qsize()):
+                    if (call := self._calls.get()) is None:
+                        return
+                    call()
         except Exception:
             traceback.print_exc()
             sys.stderr.flush()
@@ -274,21 +319,21 @@ class Presence:
     """Which processes are there, for the ready barrier."""
 
     def __init__(self):
-        self._present: set[tuple[str, int]] = set()
+        self._present: set[Process] = set()
         self._changed = threading.Condition()
 
     def update(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went."""
         with self._changed:
             change = self._present.add if present else self._present.discard
-            change((process.stage, process.replica))
+            change(process)
             self._changed.notify_all()
 
     def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
         """Blocks until all are present; False when ``until`` became true first."""
         wanted = set(expected)
         with self._changed:
-            while not wanted <= self._present:
+            while not wanted <= {(process.stage, process.replica) for process in self._present}:
                 if until():
                     return False
                 self._changed.wait(0.1)
@@ -347,7 +392,9 @@ def _config(listen: str | None, connect: str | None, network: Network | None, mo
         "connect/exit_on_failure": False,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
-        "transport/shared_memory/enabled": False,
+        # Large messages are put into shared memory by :meth:`Bus.load`, once for all who read them.
+        "transport/shared_memory/enabled": True,
+        "transport/shared_memory/transport_optimization/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
     }
     if network is not None:

@@ -272,6 +272,7 @@ def _check_items(check: Check | None) -> Check | None:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
+_NOTHING = msgspec.Raw(b"\xc0")
 
 
 @cache
@@ -317,10 +318,12 @@ def pack(record: Envelope | Step | Receipt | LogLine | Pulse) -> bytes:
     return _encoder().encode(record)
 
 
-def pack_in_parts(sealed: Envelope) -> tuple[bytes, msgspec.Raw]:
-    """The bytes of :func:`pack` as head and body, of which the second is not copied."""
-    nothing = msgspec.structs.replace(sealed, body=msgspec.Raw(b"\xc0"))
-    return pack(nothing)[:-1], sealed.body
+def pack_in_parts(sealed: Envelope) -> tuple[bytes, bytes]:
+    """The bytes of :func:`pack` as head and body, of which the second is not copied where it was just encoded."""
+    head = pack(msgspec.structs.replace(sealed, body=_NOTHING))[:-1]
+    body = memoryview(sealed.body)
+    whole = body.obj
+    return head, whole if isinstance(whole, bytes) and len(whole) == len(body) else bytes(body)
 
 
 def unpack(kind: type[R], payload: bytes) -> R:
@@ -342,6 +345,30 @@ def open_envelope(kind: type[M], sealed: Envelope) -> M:
     if sealed.version != kind.version:
         raise CodecError("Envelope", "version", f"expected {kind.__name__} {kind.version}, got {sealed.version}")
     return decode(kind, sealed.body)
+
+
+class Fields(dict[str, Any]):
+    """A message or struct whose class is not known: its fields by name."""
+
+
+def decode_untyped(body: bytes | msgspec.Raw) -> Any:
+    """Reads a message without knowing its class: maps as :class:`Fields`, arrays as arrays. Raises CodecError."""
+    return _named(_decode(cast("type[msgspec.Struct]", Any), body))
+
+
+def _named(value: Any) -> Any:
+    match value:
+        case dict():
+            return Fields({str(key): _named(inner) for key, inner in cast("dict[Any, Any]", value).items()})
+        case [str() as name, list() as shape, bytes() as data] if name in DTYPES:
+            try:
+                return _array(name, cast("list[Any]", shape), data)
+            except ValueError as error:
+                raise CodecError("array", "", str(error)) from None
+        case list():
+            return [_named(inner) for inner in cast("list[Any]", value)]
+        case _:
+            return value
 
 
 def _decode(kind: type[R], payload: bytes | msgspec.Raw) -> R:

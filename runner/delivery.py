@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from runner.bus import Process
+from runner.bus import Payload, Process
 from runner.codec import Envelope
 from runner.graph import Route
 
@@ -16,8 +16,8 @@ POLL_SECONDS = 0.1
 PATIENCE_SECONDS = 30.0
 """A publisher that is held back for longer says so."""
 
-Send = Callable[[str, bytes], None]
-"""Publishes bytes on a path of the bus."""
+Send = Callable[[str, Payload], None]
+"""Publishes on a path of the bus."""
 Warn = Callable[[str], None]
 
 
@@ -31,7 +31,7 @@ class _Entry:
 
     id: str
     lineage: str
-    payload: bytes
+    payload: Payload
     replica: int | None = None
     """Who has been given this part."""
     received: bool = False
@@ -146,8 +146,10 @@ class Delivery:
         self._changed = threading.Condition()
         self._stopping = stopping
         self._closed = False
+        self._newest: dict[tuple[str, int], Process] = {}
+        """The newest process seen of each replica."""
 
-    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
+    def publish(self, port: str, envelope: Envelope, payload: Payload) -> None:
         """Hands a message to every consumer of a port; blocks while one's queue is full. Raises Stopped."""
         for edge in self._edges:
             if edge.route.output == port:
@@ -189,9 +191,15 @@ class Delivery:
     def update(self, process: Process, present: bool) -> None:
         """Takes note of a consumer's process that came or went."""
         with self._changed:
-            for edge in self._edges:
-                if edge.route.consumer == process.stage:
-                    (edge.appeared if present else edge.vanished)(process.replica)
+            edges = [edge for edge in self._edges if edge.route.consumer == process.stage]
+            newest = self._newest.setdefault((process.stage, process.replica), process)
+            if process < newest:
+                return  # cut off and replaced, it is seen again, or only now seen to go
+            self._newest[process.stage, process.replica] = process
+            for edge in edges:
+                if process != newest:
+                    edge.vanished(process.replica)
+                (edge.appeared if present else edge.vanished)(process.replica)
 
     def drain(self, stopping: Callable[[], bool]) -> None:
         """Waits until all that was published has arrived wherever it goes: nothing hangs on this process any more."""

@@ -9,9 +9,8 @@ import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,11 +25,14 @@ from runner.delivery import Delivery, Stopped
 from runner.graph import Route, node_from_entry
 from runner.health import Heart
 from runner.inbox import Inbox, Mismatched, Ready
+from runner.network import Network
 from runner.ports import Handler
 from runner.step import Executor, receive, step_time
 
 R = TypeVar("R", Envelope, Step, Receipt)
 
+SWITCH_SECONDS = 0.0005
+"""How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
 REMEMBERED = 10_000
 """Ids a process remembers per process to recognise what it is sent twice."""
 EXIT_FAILED = 1
@@ -52,6 +54,8 @@ class Assignment(msgspec.Struct, frozen=True):
     """(stage, replica) of every process that must be there before anything is sent."""
     replica: int = 0
     incarnation: int = 0
+    network: Network | None = None
+    """None on loopback."""
     numbers: dict[str, int] = {}
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
@@ -68,7 +72,7 @@ class Host:
         self._task = assignment
         self._node = node_from_entry(assignment.stage, assignment.entry)
         self._stage = self._node.construct()
-        self._bus = Bus(assignment.run, connect=assignment.endpoint)
+        self._bus = Bus(assignment.run, connect=assignment.endpoint, network=assignment.network)
         self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
         self._presence = Presence()
         self._stopping = threading.Event()
@@ -83,7 +87,8 @@ class Host:
             log=self._log,
             numbers=assignment.numbers,
         )
-        self._deliveries: queue.SimpleQueue[_Delivered | None] = queue.SimpleQueue()
+        self._deliveries: queue.SimpleQueue[Packet | None] = queue.SimpleQueue()
+        self._receipts: deque[Receipt] = deque()
         self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
         """(port, id) of what has arrived, and whether it is consumed."""
         self._remember(assignment.consumed)
@@ -136,7 +141,9 @@ class Host:
         for consumer in {route.consumer for route in self._task.routes}:
             self._bus.subscribe(f"j/{consumer}", self._on_step)
             self._bus.subscribe(f"r/{consumer}", self._on_receipt)
-        self._bus.subscribe(f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery)
+        self._bus.subscribe(
+            f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery, first=self._hand_over
+        )
         self._bus.watch(self._on_presence)
         self._heart.start()
         self._bus.announce(self._process)
@@ -158,6 +165,10 @@ class Host:
         }
 
     def _on_presence(self, process: Process, present: bool) -> None:
+        own = self._process
+        if present and process > own and (process.stage, process.replica) == (own.stage, own.replica):
+            print(f"cut off meanwhile, and replaced by incarnation {process.incarnation}", file=sys.stderr, flush=True)
+            os._exit(EXIT_FAILED)
         self._presence.update(process, present)
         self._delivery.update(process, present)
 
@@ -174,16 +185,20 @@ class Host:
         elif receipt is not None:
             self._delivery.receive(consumer, receipt.port, receipt.id)
 
-    def _on_delivery(self, packet: Packet) -> None:
-        """Gives a receipt at once, however long the present step takes."""
-        envelope = self._read(Envelope, packet)
-        if envelope is not None:
-            port = packet.key.rpartition("/")[2]
-            receipt = Receipt(port, envelope.id, consumed=self._arrived.get((port, envelope.id), False))
-            self._bus.publish(f"r/{self._process.stage}", codec.pack(receipt))
-            if port in self._received:
-                self._received[port] += 1
-            self._deliveries.put(_Delivered(packet, port, envelope))
+    def _hand_over(self, packet: Packet) -> None:
+        """To the thread that runs steps, before anything else is done about it; then comes :meth:`_on_delivery`."""
+        port = _port_of(packet)
+        if port in self._received:
+            self._received[port] += 1
+        with contextlib.suppress(CodecError):  # what is malformed is refused by who takes it
+            id = codec.unpack(Envelope, packet.payload).id
+            self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
+        self._deliveries.put(packet)
+
+    def _on_delivery(self, _: Packet) -> None:
+        """Gives receipts at once, however long the present step takes."""
+        while self._receipts:
+            self._bus.publish(f"r/{self._process.stage}", codec.pack(self._receipts.popleft()))
 
     def _read(self, kind: type[R], packet: Packet) -> R | None:
         try:
@@ -197,20 +212,21 @@ class Host:
         self._refused += 1
         self._log(f"{packet.key}: message refused ({self._refused} so far): {error}", "error")
 
-    def _take(self, delivered: "_Delivered") -> None:
+    def _take(self, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
-        packet, envelope = delivered.packet, delivered.envelope
-        if delivered.port in self._decoded:
-            self._decoded[delivered.port] += 1
-        if (delivered.port, envelope.id) in self._arrived:
-            return
+        name = _port_of(packet)
+        if name in self._decoded:
+            self._decoded[name] += 1
         try:
-            port = self._node.type.inputs.get(delivered.port)
+            envelope = codec.unpack(Envelope, packet.payload)
+            if (name, envelope.id) in self._arrived:
+                return
+            port = self._node.type.inputs.get(name)
             if port is None:
                 raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
             travelled = packet.arrived_ns - packet.sent_ns if packet.sent_ns else 0
             self._inbox.add(receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled))
-            self._arrived[delivered.port, envelope.id] = False
+            self._arrived[name, envelope.id] = False
         except (CodecError, Mismatched) as error:
             self._refuse(packet, error)
 
@@ -286,7 +302,7 @@ class Host:
 
     def _emit(self, envelope: Envelope) -> None:
         """Sends a message, to the recorder first."""
-        payload = codec.pack(envelope)
+        payload = self._bus.load(*codec.pack_in_parts(envelope))
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
@@ -321,15 +337,6 @@ class Host:
     def _log(self, text: str, level: Level) -> None:
         line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
         self._bus.publish(f"l/{self._process.stage}", codec.pack(line))
-
-
-@dataclass(frozen=True, slots=True)
-class _Delivered:
-    """A message as it came, not yet decoded."""
-
-    packet: Packet
-    port: str
-    envelope: Envelope
 
 
 class _Record:
@@ -396,6 +403,10 @@ class _Record:
         )
 
 
+def _port_of(packet: Packet) -> str:
+    return packet.key.rpartition("/")[2]
+
+
 def _summary(error: Exception) -> str:
     """An exception in one line: its type, its text and where it was raised."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
@@ -406,6 +417,7 @@ def _summary(error: Exception) -> str:
 def main() -> int:
     """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
     die_with_parent()
+    sys.setswitchinterval(SWITCH_SECONDS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
