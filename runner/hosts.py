@@ -177,6 +177,7 @@ class Hosts:
         self._document = read_document(file)
         self._say = say
         self._run = ""
+        self._closing = False
         self._places = {host: _Place(host) for host in layout.names[1:]}
         self._present: set[Process] = set()
         self._changed = threading.Condition(threading.RLock())
@@ -229,6 +230,7 @@ class Hosts:
 
     def close(self, code: int, reason: str) -> None:
         """Sends every host home and closes the place where all meet."""
+        self._closing = True
         for place in self._places.values():
             self._order(place, Dismiss(code, reason))
         with self._changed:
@@ -267,7 +269,11 @@ class Hosts:
         with self._changed:
             (self._present.add if present else self._present.discard)(process)
             self._changed.notify_all()
-            if place.hello is not None and place.hello.session == process.incarnation and not present:
+            if (
+                place.hello is not None
+                and place.hello.session == process.incarnation
+                and not (present or self._closing)
+            ):
                 self._lose(place)
 
     def _on_report(self, packet: Packet) -> None:

@@ -15,7 +15,7 @@ import contextlib
 import datetime
 import ipaddress
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.contract import Refused
-from runner.network import Credentials
+from runner.network import Credentials, Host
 
 Extension = tuple[x509.ExtensionType, bool]
 """What a certificate says beside names and dates, and whether who does not understand it must refuse."""
@@ -37,17 +37,8 @@ HOST_DAYS = 825
 AUTHORITY = "runner network"
 
 
-@dataclass(frozen=True, slots=True)
-class Owner:
-    """Whom a certificate is for."""
-
-    name: str
-    address: str
-    """IP address or DNS name under which the others reach it; empty for one that nobody calls."""
-
-
-def make_keys(folder: Path, owners: list[Owner]) -> None:
-    """Makes an authority and a certificate for each owner; raises Refused where the folder has keys already."""
+def make_keys(folder: Path, hosts: Sequence[Host]) -> None:
+    """Makes an authority and a certificate for each host; raises Refused where the folder has keys already."""
     if (folder / "ca.pem").exists() or (folder / "ca-key.pem").exists():
         raise Refused(
             f"{folder}: there are keys already and they are not overwritten; "
@@ -56,13 +47,13 @@ def make_keys(folder: Path, owners: list[Owner]) -> None:
     _make_folder(folder)
     authority = _sign(AUTHORITY, days=CA_DAYS, extensions=_AUTHORITY)
     _write_pair(folder / "ca.pem", folder / "ca-key.pem", authority)
-    _add(folder, authority, owners)
+    _add(folder, authority, hosts)
 
 
-def add_keys(folder: Path, owners: list[Owner]) -> None:
+def add_keys(folder: Path, hosts: Sequence[Host]) -> None:
     """Makes certificates with the authority that is there; raises Refused where one would be overwritten."""
     authority = _read_certificate(folder / "ca.pem"), _read_key(folder / "ca-key.pem")
-    _add(folder, authority, owners)
+    _add(folder, authority, hosts)
 
 
 def credentials(folder: Path, host: str) -> Credentials:
@@ -124,26 +115,26 @@ def _sign(name: str, *, days: int, extensions: list[Extension], by: Signed | Non
     return builder.sign(issuer_key, hashes.SHA256()), key
 
 
-def _add(folder: Path, authority: Signed, owners: list[Owner]) -> None:
-    taken = [owner.name for owner in owners if (folder / owner.name).exists()]
+def _add(folder: Path, authority: Signed, hosts: Sequence[Host]) -> None:
+    taken = [host.name for host in hosts if (folder / host.name).exists()]
     if taken:
         raise Refused(f"{folder / taken[0]}: is there already and is not overwritten; remove it to make another")
-    for owner in owners:
-        own = folder / owner.name
+    for host in hosts:
+        own = folder / host.name
         _make_folder(own)
-        signed = _sign(owner.name, days=HOST_DAYS, extensions=_extensions(owner), by=authority)
+        signed = _sign(host.name, days=HOST_DAYS, extensions=_extensions(host), by=authority)
         _write_pair(own / "cert.pem", own / "key.pem", signed)
         _write(own / "ca.pem", authority[0].public_bytes(serialization.Encoding.PEM))
 
 
-def _extensions(owner: Owner) -> list[Extension]:
+def _extensions(host: Host) -> list[Extension]:
     """A host both calls and is called, so its certificate serves both sides of a link."""
     usage = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
-    names: list[x509.GeneralName] = [x509.DNSName(owner.name)]
+    names: list[x509.GeneralName] = [x509.DNSName(host.name)]
     with contextlib.suppress(ValueError):
-        names.append(x509.IPAddress(ipaddress.ip_address(owner.address)))
-    if len(names) == 1 and owner.address not in ("", owner.name):
-        names.append(x509.DNSName(owner.address))
+        names.append(x509.IPAddress(ipaddress.ip_address(host.address)))
+    if len(names) == 1 and host.address not in ("", host.name):
+        names.append(x509.DNSName(host.address))
     return [
         (x509.BasicConstraints(ca=False, path_length=None), True),
         (usage, False),

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -22,7 +22,7 @@ from typing import Any, cast
 import msgspec
 
 from runner.contract import Refused
-from runner.document import Document, suggest
+from runner.document import Document, read_document, suggest
 
 LOOPBACK = "127.0.0.1"
 ROUTER = "router"
@@ -103,16 +103,20 @@ class Layout:
 
     def network(self, name: str, credentials: Credentials | None) -> Network:
         """What the sessions of a host are told."""
-        host = next(host for host in self.hosts if host.name == name)
-        others = (ROUTER,) if self.router is not None and not self.router_is_head else ()
+        host = next(host for host in self.certified if host.name == name)
         return Network(
             host=name,
             head=self.head.name,
-            hosts=(*self.names, *others),
+            hosts=tuple(host.name for host in self.certified),
             listen=self._endpoint_of(Host(name, host.address)),
             routed=self.router is not None,
             credentials=credentials,
         )
+
+    @property
+    def certified(self) -> tuple[Host, ...]:
+        """Everybody who needs a certificate: the hosts, and a router that is none of them."""
+        return self.hosts if self.router is None or self.router_is_head else (*self.hosts, self.router)
 
     def to_entry(self) -> dict[str, Any]:
         """The keys of a graph file that say this."""
@@ -134,20 +138,39 @@ ALONE = Layout()
 
 def read_layout(document: Document) -> Layout:
     """Reads the hosts of a graph file; raises Refused with the place of what cannot work or is not safe."""
-    hosts = tuple(_read_host(document, name, value) for name, value in _entries(document).items())
-    keys = _read_keys(document)
-    if not hosts:
+    layout = _read_unchecked(document)
+    if not layout.hosts:
         given = next((key for key in ("keys", "router") if document.values.get(key) is not None), None)
         if given is not None:
             raise Refused(f"{document.place(given)}: says nothing without hosts; add: hosts: {{head: ADDRESS:PORT}}")
         return ALONE
-    layout = Layout(hosts, keys, _read_router(document, hosts))
     _refuse_open(document, layout)
     if layout.router in (None, layout.head) and not layout.head.port:
         head = layout.head
         place = document.place("hosts", head.name)
         raise Refused(f"{place}: the others must know where to call; add a port: {head.name}: {head}:7447")
     return layout
+
+
+def _read_unchecked(document: Document) -> Layout:
+    hosts = tuple(_read_host(document, name, value) for name, value in _entries(document).items())
+    return Layout(hosts, _read_keys(document), _read_router(document, hosts) if hosts else None)
+
+
+def read_owners(what: Sequence[str]) -> tuple[Layout, Path]:
+    """Who is to have keys, from a graph file or NAME=ADDRESS, and the folder that the graph keeps them in."""
+    if len(what) == 1 and "=" not in what[0]:
+        document = read_document(Path(what[0]))
+        layout = _read_unchecked(document)
+        if not layout.hosts:
+            raise Refused(f"{what[0]}: names no hosts; add: hosts: {{head: ADDRESS:PORT, worker1: ADDRESS}}")
+        return layout, layout.keys or document.folder / "keys"
+    pairs = [text.partition("=") for text in what]
+    for name, equals, address in pairs:
+        if not (name and equals and address):
+            raise Refused(f"{name}: expected one graph file, or hosts as NAME=ADDRESS")
+    hosts = tuple(read_endpoint(address, f"{name}={address}", name=name) for name, _, address in pairs)
+    return Layout(hosts), Path("keys")
 
 
 def read_endpoint(text: str, place: str, *, name: str) -> Host:

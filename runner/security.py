@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from runner.network import Credentials, Network
+from runner.network import ROUTER, Credentials, Layout, Network
 
 EVERYTHING = (
     *("put", "delete", "declare_subscriber"),
@@ -21,7 +24,8 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     Whoever shows no certificate of the graph's authority is not let in. Whoever is let in and is none of the graph's
     hosts gets and sends nothing. Only the head has processes started.
     """
-    others = [name for name in network.hosts if name != network.head]
+    # What a router sends on it has got from the head, or refused itself.
+    others = [name for name in network.hosts if name not in (network.head, ROUTER)]
     rules = [
         _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
         _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
@@ -56,3 +60,23 @@ def _tls(credentials: Credentials) -> dict[str, Any]:
 def _rule(name: str, permission: str, messages: tuple[str, ...], flows: tuple[str, ...], keys: str) -> dict[str, Any]:
     rule = {"id": name, "permission": permission, "messages": list(messages), "flows": list(flows)}
     return {**rule, "key_exprs": [keys]}
+
+
+def write_router(folder: Path, layout: Layout) -> Path:
+    """Writes what a router that is none of the hosts must be told; its paths are relative to where it is started."""
+    own, layout = folder / ROUTER, replace(layout, keys=folder)
+    credentials = Credentials(*(str(own / file) for file in ("ca.pem", "cert.pem", "key.pem")))
+    config: dict[str, Any] = {
+        "mode": "router",
+        "listen": {"endpoints": [layout.endpoint]},
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    for key, value in security(layout.network(ROUTER, credentials), credentials).items():
+        *outer, last = key.split("/")
+        inner = config
+        for name in outer:
+            inner = inner.setdefault(name, {})
+        inner[last] = value
+    path = own / "zenohd.json5"
+    path.write_text(json.dumps(config, indent=2))
+    return path
