@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from runner.contract import Message, Tolerances
 from runner.graph import Node
 from runner.ports import Handler
 from runner.recording import Recording, replicated, split_id, topic_of
-from runner.step import Arrival, Executor, receive, step_time
+from runner.step import Arrival, Executor, Log, receive, step_time
 from runner.summary import FieldChange, Summary
 from runner.tolerances import outside
 
@@ -107,38 +108,53 @@ class Execution:
     """What the handler raised."""
     refused: str = ""
     """Why it could not be executed at all."""
+    ended: bool = False
+    """True once the handler has nothing more to emit."""
 
 
 class Reenactment:
     """A new instance of a stage and the steps it takes again."""
 
-    def __init__(self, recording: Recording, node: Node, steps: Sequence[Step], *, seed: int, directory: Path) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        node: Node,
+        steps: Sequence[Step],
+        *,
+        seed: int,
+        directory: Path,
+        log: Log = lambda *_: None,
+    ) -> None:
         """Constructs the stage; raises Refused where that fails."""
         self._recording = recording
         self._node = node
         self.stage = node.construct()
         numbers = _first_numbers(steps)
-        self._executor = Executor(
-            node, self.stage, seed=seed, directory=directory, log=lambda *_: None, numbers=numbers
-        )
+        self._executor = Executor(node, self.stage, seed=seed, directory=directory, log=log, numbers=numbers)
         self.seconds = 0.0
 
     def execute(self, step: Step) -> Execution:
         """Takes one step; what a handler raises is noted, not raised."""
+        return deque(self.take(step), maxlen=1)[0]
+
+    def take(self, step: Step) -> Iterator[Execution]:
+        """Takes one step message by message: pauses after each, inside the handler, and once more at its end."""
         done = Execution(step)
         handler = next((handler for handler in self._node.type.handlers if handler.name == step.handler), None)
-        if handler is None:
-            done.refused = f"{step.handler}: the stage has no such handler any more"
-            return done
         try:
             done.arrivals = self._arrivals(step)
         except CodecError as error:
             done.refused = f"it cannot be executed: {error}"
         except KeyError as error:
             done.refused = f"it cannot be executed: {error.args[0]} is not recorded"
-        else:
-            self._run(done, handler)
-        return done
+        if handler is None:
+            done.refused = f"{step.handler}: the stage has no such handler any more"
+        elif not done.refused:
+            for sealed in self._emissions(done, handler):
+                done.emitted.append(sealed)
+                yield done
+        done.ended = True
+        yield done
 
     def _arrivals(self, step: Step) -> list[Arrival]:
         arrivals: list[Arrival] = []
@@ -151,18 +167,24 @@ class Reenactment:
                 raise CodecError(f"input {id}: {error.type}", error.field, error.reason) from None
         return arrivals
 
-    def _run(self, done: Execution, handler: Handler) -> None:
+    def _emissions(self, done: Execution, handler: Handler) -> Iterator[Envelope]:
+        """What the handler emits; a stage that was stopped is not asked for more than it had emitted."""
         step = done.step
         time_ns = step_time(self._node, done.arrivals, step.time_ns)
         wanted = len(step.emitted) if step.outcome == "stopped" else None
-        began = time.perf_counter()
-        try:
-            for sealed in itertools.islice(self._executor.run(handler, done.arrivals, time_ns), wanted):
-                done.emitted.append(sealed)
-        except Exception as error:
-            done.error = f"{type(error).__name__}: {error}"
-        finally:
-            self.seconds += time.perf_counter() - began
+        emissions = itertools.islice(self._executor.run(handler, done.arrivals, time_ns), wanted)
+        while True:
+            began = time.perf_counter()
+            try:
+                sealed = next(emissions, None)
+            except Exception as error:
+                done.error = f"{type(error).__name__}: {error}"
+                return
+            finally:
+                self.seconds += time.perf_counter() - began
+            if sealed is None:
+                return
+            yield sealed
 
 
 class Comparison:
