@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.codec import Fields
+
 SHOWN = 60
 """Characters of a value that are shown."""
 
@@ -34,7 +36,7 @@ class Difference:
     @property
     def pattern(self) -> str:
         """The field without indices, for example ``objects[].T_camera_object[]``."""
-        return re.sub(r"\[[^\]]*\]", "[]", self.field)
+        return re.sub(r"\[[\d, ]*\]", "[]", self.field)
 
     def __str__(self) -> str:
         extent = f" ({self.extent})" if self.extent else ""
@@ -67,7 +69,8 @@ def _mapping_differences(
     if recorded.keys() != replayed.keys():
         yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ", owner=owner)
     for key in filter(replayed.__contains__, recorded):
-        yield from differences(recorded[key], replayed[key], f"{field}[{key!r}]", owner)
+        place = f"{field}.{key}".lstrip(".") if isinstance(recorded, Fields) else f"{field}[{key!r}]"
+        yield from differences(recorded[key], replayed[key], place, owner)
 
 
 def _sequence_differences(

@@ -45,6 +45,11 @@ class Entry:
     """Name of the type."""
     log_time_ns: int
     """When the recorder received it, nanoseconds since the epoch."""
+    publish_time_ns: int
+    """Logical time."""
+    sequence: int
+    channel: int
+    """Number of its channel, see :attr:`Container.channels`."""
     data: bytes
     offset: int
     """Of the chunk or record that holds it, for :meth:`Container.entries_at`."""
@@ -73,8 +78,8 @@ class Container:
         """Payloads whose topic stood in a part of the file that is damaged."""
         self._stream = stream
         self._name = name
-        self._channels: dict[int, Channel] = {}
-        self._schemas: dict[int, str] = {0: ""}
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
 
     def __iter__(self) -> Iterator[Entry | Metadata]:
         """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all."""
@@ -114,19 +119,24 @@ class Container:
         for inner in self._opened(record, offset) if isinstance(record, Chunk) else (record,):
             match inner:
                 case Channel():
-                    self._channels[inner.id] = inner
+                    self.channels[inner.id] = inner
                 case Schema():
-                    self._schemas[inner.id] = inner.name
-                case McapMessage(channel_id=id) if id not in self._channels:
+                    self.schemas[inner.id] = inner
+                case McapMessage(channel_id=id) if id not in self.channels:
                     self.unknown += 1
                 case McapMessage():
-                    channel = self._channels[inner.channel_id]
-                    schema = self._schemas.get(channel.schema_id, "")
-                    yield Entry(channel.topic, schema, inner.log_time, inner.data, offset)
+                    yield self._entry(inner, offset)
                 case Metadata():
                     yield inner
                 case _:
                     pass
+
+    def _entry(self, message: McapMessage, offset: int) -> Entry:
+        channel = self.channels[message.channel_id]
+        schema = self.schemas.get(channel.schema_id)
+        times = message.log_time, message.publish_time
+        name = schema.name if schema else ""
+        return Entry(channel.topic, name, *times, message.sequence, channel.id, message.data, offset)
 
     def _opened(self, chunk: Chunk, offset: int) -> Iterable[McapRecord]:
         try:

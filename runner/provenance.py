@@ -21,6 +21,13 @@ def package_versions() -> dict[str, str]:
     return {found.name: found.version for found in sorted(distributions(), key=lambda found: found.name.lower())}
 
 
+def changed_packages(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
+    """Each package whose version differs."""
+    for name in sorted({*then, *now}, key=str.lower):
+        if then.get(name) != now.get(name):
+            yield f"{name} {then.get(name, 'absent')} -> {now.get(name, 'absent')}"
+
+
 def revision() -> str:
     """The git commit of this source, with ``-dirty`` where it was changed since; empty outside a checkout."""
     commit = _git("rev-parse", "HEAD")

@@ -18,17 +18,24 @@ import msgspec
 from mcap.writer import CompressionType, Writer
 
 from runner.bus import RECORDER, Bus, Packet, Process
-from runner.children import die_with_parent
+from runner.children import die_with_parent, explain_death, is_orphan
 from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
 from runner.contract import Message, Refused
 from runner.health import Heart
+from runner.network import Network
 from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording import JOURNAL, LOG, PROFILE, RUN, VERDICT, Ledger, Verdict, replicated, split_id, topic_of
+from runner.refusals import Refusals
+from runner.tap import Tap
 
 FLUSH_SECONDS = 0.25
 """A killed recorder loses no more than this."""
 CHUNK_BYTES = 4 * 2**20
+ORPHANED_SECONDS = 5.0
+"""What stages may take to die with their supervisor before a recorder that outlives it stops waiting for them."""
+LAST_RESORT_SECONDS = 30
+"""After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
 EXIT_REFUSED = 2
 BACKLOG_BYTES = 2**30
@@ -59,6 +66,10 @@ class Manifest(msgspec.Struct, frozen=True):
     """``--set`` assignments, as typed."""
     topics: dict[str, Topic]
     """By topic, ``stage/port``."""
+    network: Network | None = None
+    """None on loopback."""
+    secret: str = ""
+    """Of the run's bus."""
 
 
 def topic(kind: type[Message]) -> Topic:
@@ -108,9 +119,11 @@ class RecordingWriter:
         self._writer.flush()
         self._ledger = Ledger(replicated(json.loads(manifest.graph)))
         self._channels: dict[str, int] = {}
-        self._queue: queue.SimpleQueue[_Payload | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Payload | Callable[[], None] | None] = queue.SimpleQueue()
         self._counting = threading.Lock()
         self._waiting_bytes = 0
+        self._unflushed: list[str] = []
+        """Ids that are not on their way to the disk yet."""
         self._problems: list[str] = []
         self._dropped = 0
         self._recorded = 0
@@ -122,10 +135,10 @@ class RecordingWriter:
         """Takes one payload as it came over the bus."""
         with self._counting:
             if self._waiting_bytes > BACKLOG_BYTES:
-                self._dropped += 1
+                self._lose(kind, data)
                 return
             self._waiting_bytes += len(data)
-        self._queue.put(_Payload(kind, data, time.time_ns()))
+            self._queue.put(_Payload(kind, data, time.time_ns()))
 
     def vitals(self) -> dict[str, Any]:
         """What the recorder's pulse says: records that are written, were refused and wait for the disk."""
@@ -135,6 +148,16 @@ class RecordingWriter:
             "refused": self._malformed,
             "queued": {"disk": self._queue.qsize()},
         }
+
+    def after_flush(self, action: Callable[[], None]) -> None:
+        """Acts, on the writer's thread, once everything that was put before can be read in the file."""
+        self._queue.put(action)
+        if not self._thread.is_alive():  # nothing more will be
+            action()
+
+    def lament(self, problem: str) -> None:
+        """Has the verdict name a reason why not everything may be there."""
+        self._problems.append(problem)
 
     def close(self) -> Verdict:
         """Writes what is waiting, the verdict and the end of the file."""
@@ -147,12 +170,37 @@ class RecordingWriter:
             self._write_payloads()
             self._write_verdict()
         except OSError as error:
-            self._problems.append(f"writing failed: {error.strerror}")
-            self._refuse(f"recording ends here: {error.strerror}")
-            self._waiting_bytes = BACKLOG_BYTES + 1
+            self._give_up(error)
         finally:
             with contextlib.suppress(OSError):
                 self._file.close()
+
+    def _give_up(self, error: OSError) -> None:
+        """Nothing can be written any more: what is waiting, and all that will still come, is named as missing."""
+        with self._counting:
+            self._waiting_bytes = BACKLOG_BYTES + 1
+            self._problems.append(f"writing failed: {error.strerror}")
+            for id in self._unflushed:
+                self._ledger.lost(id)
+            while not self._queue.empty():
+                payload = self._queue.get()
+                if isinstance(payload, _Payload):
+                    self._lose(payload.kind, payload.data)
+                elif payload is not None:
+                    payload()
+        self._refuse(f"recording ends here: {error.strerror}")
+
+    def _lose(self, kind: Kind, data: bytes) -> None:
+        """Counts a payload that is not recorded, and names what it is or speaks of."""
+        self._dropped += 1
+        with contextlib.suppress(CodecError):
+            match unpack(kind, data):
+                case Envelope(id=id):
+                    self._ledger.lost(id)
+                case Step() as step:
+                    self._ledger.step(step)
+                case _:
+                    pass
 
     def _write_payloads(self) -> None:
         due = time.monotonic() + FLUSH_SECONDS
@@ -161,12 +209,20 @@ class RecordingWriter:
                 payload = self._queue.get(timeout=max(0.0, due - time.monotonic()))
                 if payload is None:
                     return
+                if not isinstance(payload, _Payload):
+                    self._flush()
+                    payload()
+                    continue
                 with self._counting:
                     self._waiting_bytes -= len(payload.data)
                 self._write(payload)
             if time.monotonic() >= due:
-                self._writer.flush()
+                self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._unflushed.clear()
 
     def _write(self, payload: _Payload) -> None:
         try:
@@ -178,6 +234,7 @@ class RecordingWriter:
         match record:
             case Envelope():
                 self._ledger.message(record.id)
+                self._unflushed.append(record.id)
                 self._add(topic_of(record.id), record.type, payload, record.time_ns, split_id(record.id)[1])
             case Step():
                 self._ledger.step(record)
@@ -201,13 +258,13 @@ class RecordingWriter:
     def _write_verdict(self) -> None:
         verdict = self._verdict()
         self._writer.flush()
-        missing = json.dumps(verdict.missing)
-        self._writer.add_metadata(VERDICT, {"verdict": verdict.word, "missing": missing, "reason": verdict.reason})
+        self._writer.add_metadata(VERDICT, verdict.metadata())
         self._writer.finish()
 
     def _verdict(self) -> Verdict:
         problems = list(self._problems)
-        problems += [f"{self._dropped} payloads dropped: the disk was too slow"] if self._dropped else []
+        reason = "" if self._problems else ": the disk was too slow"
+        problems += [f"{self._dropped} payloads dropped{reason}"] if self._dropped else []
         missing = self._ledger.missing()
         return Verdict(not missing and not problems, missing, "; ".join(problems))
 
@@ -232,23 +289,30 @@ class Recorder:
     def __init__(self, manifest: Manifest) -> None:
         """Creates the recording; raises Refused where that fails."""
         self._stopping = threading.Event()
-        self._bus = Bus(manifest.run, connect=manifest.endpoint)
+        self._bus = Bus(manifest.run, secret=manifest.secret, connect=manifest.endpoint, network=manifest.network)
         self._writer = RecordingWriter(manifest, self._complain)
+        self._tap = Tap(self._bus)
         self._echoes: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
+        self._gone: set[Process] = set()
         self._echo = threading.Thread(target=self._echo_all, name="echo", daemon=True)
-        self._heart = Heart(Process(RECORDER, 0), self._bus, self._writer.vitals)
+        self._refusals = Refusals(self._complain)
+        self._present: set[Process] = set()
+        """Processes of stages."""
+        self._heart = Heart(Process(RECORDER, 0), self._bus, self._vitals)
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
         self._echo.start()
-        self._bus.subscribe("m/**", lambda packet: self._writer.put(Envelope, packet.payload))
+        self._bus.subscribe("m/**", self._on_message)
         self._bus.subscribe("s/*", self._on_step)
-        self._bus.subscribe("l/*", lambda packet: self._writer.put(LogLine, packet.payload))
-        self._bus.watch(self._on_presence)
+        self._bus.subscribe("l/*", self._on_log)
+        self._bus.watch(self._on_presence, self._refusals.refuse)
         self._bus.answer_flush()
         self._bus.announce(Process(RECORDER, 0))
         self._heart.start()
         self._stopping.wait()
+        if is_orphan():
+            self._outlive()
         self._heart.stop()
         self._echoes.put(None)
         self._echo.join(FLUSH_SECONDS)
@@ -259,13 +323,48 @@ class Recorder:
         """Ends :meth:`run` after what has arrived. May be called from a signal handler."""
         self._stopping.set()
 
+    def _on_message(self, packet: Packet) -> None:
+        if self._take(Envelope, packet):
+            self._tap.pass_on(packet)
+
+    def _outlive(self) -> None:
+        """The stages die with the supervisor; what they have said until then is recorded."""
+        signal.alarm(LAST_RESORT_SECONDS)
+        deadline = time.monotonic() + ORPHANED_SECONDS
+        while self._present and time.monotonic() < deadline:
+            time.sleep(FLUSH_SECONDS / 5)
+        self._writer.lament("the supervisor died")
+
+    def _vitals(self) -> dict[str, Any]:
+        vitals = self._writer.vitals()
+        return {**vitals, "refused": vitals["refused"] + self._refusals.count}
+
+    def _take(self, kind: Kind, packet: Packet) -> bool:
+        """Records a packet of the run; what strays in is refused. Whether a record is malformed, the writer sees."""
+        if packet.genuine:
+            self._writer.put(kind, packet.payload)
+        else:
+            self._refusals.read(kind, packet)
+        return packet.genuine
+
+    def _on_log(self, packet: Packet) -> None:
+        self._take(LogLine, packet)
+
     def _on_step(self, packet: Packet) -> None:
-        self._writer.put(Step, packet.payload)
-        self._echoes.put((f"j/{packet.key.partition('/')[2]}", packet.payload))
+        """Refuses what a process says that was cut off: the others know it as gone, and do its work again."""
+        with contextlib.suppress(CodecError):  # what is malformed is refused by the writer
+            step = unpack(Step, packet.payload)
+            if Process(step.stage, step.replica, step.incarnation) in self._gone:
+                return
+        if self._take(Step, packet):
+            self._echoes.put((f"j/{packet.key.partition('/')[2]}", packet.payload))
 
     def _on_presence(self, process: Process, present: bool) -> None:
+        if process.stage != RECORDER:
+            (self._present.add if present else self._present.discard)(process)
         if not present:
-            self._echoes.put((f"gone/{process.path}", b""))
+            self._gone.add(process)
+            self._writer.after_flush(lambda: self._echoes.put((f"gone/{process.path}", b"")))
 
     def _echo_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
@@ -280,8 +379,10 @@ class Recorder:
 def main() -> int:
     """Records the run on stdin until SIGTERM; exits 0 when the recording is complete, its last line on stderr says
     what is missing."""
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    explain_death()
+    die_with_parent(signal.SIGTERM)
+    for signum in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(signum, signal.SIG_IGN)
     manifest = msgspec.json.decode(sys.stdin.buffer.read(), type=Manifest)
     try:
         recorder = Recorder(manifest)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mcap.records import Metadata
+from mcap.records import Channel, Metadata, Schema
 
 from runner.codec import CodecError, Envelope, LogLine, Step, unpack
 from runner.container import Container, Damage, Entry, open_file
@@ -27,6 +27,13 @@ RUN = "run"
 VERDICT = "verdict"
 OPEN_CHUNKS = 8
 """Decompressed chunks kept in memory while messages are looked up by id."""
+
+
+def payload_kind(topic: str) -> type[Envelope] | type[Step] | type[LogLine]:
+    """What is recorded under a topic."""
+    if topic.startswith(JOURNAL):
+        return Step
+    return LogLine if topic.startswith(LOG) else Envelope
 
 
 def split_id(id: str) -> tuple[str, int]:
@@ -68,6 +75,10 @@ class Verdict:
         """COMPLETE or INCOMPLETE."""
         return "COMPLETE" if self.complete else "INCOMPLETE"
 
+    def metadata(self) -> dict[str, str]:
+        """As it stands in a file."""
+        return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason}
+
     def __str__(self) -> str:
         more = f" and {len(self.missing) - 5} more" if len(self.missing) > 5 else ""
         reasons = [self.reason] if self.reason else []
@@ -100,6 +111,11 @@ class Ledger:
         self._named.update(id for _, id in step.consumed)
         self._named.update(step.emitted)
 
+    def lost(self, id: str) -> None:
+        """Enters a message that came and could not be kept."""
+        self._recorded.discard(id)
+        self._named.add(id)
+
     def missing(self) -> tuple[str, ...]:
         """Ids that should be there and are not, by port and sequence."""
         contiguous = {
@@ -114,6 +130,14 @@ class Ledger:
 def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     """The stages of a graph, as recorded, that run as replicas."""
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
+
+
+def _readable(entry: Entry) -> bool:
+    try:
+        unpack(payload_kind(entry.topic), entry.data)
+    except CodecError:
+        return False
+    return True
 
 
 class Recording:
@@ -183,6 +207,23 @@ class Recording:
             return Verdict(False, missing, f"damaged at {self.damage[0]}")
         return Verdict(written.get("verdict") == "COMPLETE" and not missing, missing, written.get("reason", ""))
 
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """MCAP's channels, by the number that entries give."""
+        return self._container.channels
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """MCAP's schemas, by the number that channels give."""
+        return self._container.schemas
+
+    def records(self) -> Iterator[Entry | Metadata]:
+        """Everything in the file once more, as it was written; what cannot be read is left out."""
+        with open_file(self.path) as file:
+            container = Container(file, str(self.path))
+            container.channels.update(self.channels)
+            yield from (record for record in container if isinstance(record, Metadata) or _readable(record))
+
     def envelope(self, id: str) -> Envelope:
         """One message by id; raises KeyError where it is not recorded."""
         offset = self.messages[id].offset
@@ -211,15 +252,15 @@ class Recording:
             self.damage.append(Damage(record.offset, f"a record of {record.topic}: {error}"))
 
     def _enter_entry(self, entry: Entry) -> None:
-        if entry.topic.startswith(JOURNAL):
-            self.steps.append(unpack(Step, entry.data))
-        elif entry.topic.startswith(LOG):
-            self.log.append(unpack(LogLine, entry.data))
-        else:
-            sealed = unpack(Envelope, entry.data)
-            self.repeated[sealed.id] += sealed.id in self.messages
-            located = Located(sealed.id, entry.topic, sealed.type, entry.log_time_ns, len(entry.data), entry.offset)
-            self.messages.setdefault(sealed.id, located)
+        match unpack(payload_kind(entry.topic), entry.data):
+            case Step() as step:
+                self.steps.append(step)
+            case LogLine() as line:
+                self.log.append(line)
+            case Envelope(id=id, type=kind):
+                self.repeated[id] += id in self.messages
+                located = Located(id, entry.topic, kind, entry.log_time_ns, len(entry.data), entry.offset)
+                self.messages.setdefault(id, located)
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:
         envelopes: dict[str, Envelope] = {}

@@ -23,10 +23,10 @@ def test_counts_messages_by_field_and_keeps_the_largest_difference():
 
 def test_indices_of_one_message_are_one_change_and_text_has_no_magnitude():
     summary = Summary()
-    summary.add("a/b", "a.b#0", differences(({"x": 1.0}, {"x": 2.0}), ({"x": 1.5}, {"x": 4.0})))
+    summary.add("a/b", "a.b#0", differences(({"x": 1.0}, {"x": 2.0}), ({"x": 1.5}, {"x": 4.5})))
     summary.add("a/c", "a.c#0", differences("left", "right"))
     numbers, text = summary.changes
-    assert (numbers.field, numbers.messages, numbers.largest) == ("[][]", 1, 2.0)
+    assert (numbers.field, numbers.messages, numbers.largest) == ("[]['x']", 1, 2.5)
     assert (text.largest, summary.lines()[-1].split()[-2]) == (None, "-")
 
 
