@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
 from benchmarks.datasets import Image, detections_file, images
@@ -45,6 +46,7 @@ from stages.perception.metrics import pose_errors
 from stages.perception.refinement import Placed, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue, Floats
 
+Truths = NDArray[np.bool_]
 _ROOT = Path(__file__).parents[1]
 _CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
 _PLOT = _ROOT / "docs" / "figures" / "reliability.png"
@@ -68,7 +70,7 @@ _STANDING = ("mug", "cup", "soup_can", "tuna_can", "sauce_bottle", "water_bottle
              "milk_carton", "salt_shaker")  # fmt: skip
 """Objects that look nearly the same when they are turned or flipped."""
 KINDS = {
-    "clutter": Kind(Pile(), exact=30, noisy=15),
+    "clutter": Kind(Pile(), exact=20, noisy=10),
     "coarse": Kind(
         Pile(
             counts=(6, 7, 5, 8, 6), spread=0.035, least_visible=0.04, distance=(1.1, 1.7), sensor=_COARSE,
@@ -79,20 +81,20 @@ KINDS = {
         Pile(
             counts=(7, 6, 8, 7, 5), labels=_STANDING, spread=0.03, least_visible=0.03, pitch=(8.0, 30.0),
             jitter=0.1, false=(2, 4),
-        ), exact=48, noisy=24,
+        ), exact=40, noisy=20,
     ),
     "heaps": Kind(
         Pile(
             counts=(8, 9, 7, 10, 8), spread=0.03, least_visible=0.03, views=8, pitch=(20.0, 55.0),
             jitter=0.1, false=(2, 4),
-        ), exact=24, noisy=12,
+        ), exact=20, noisy=10,
     ),
 }  # fmt: skip
 """Clutter-15's piles; seen from afar by a coarse sensor; standing objects seen from low down, which hides handles and
 shows flips alike; and heaps in which objects show a few percent of themselves."""
 POSE_SCALES = (10.0, 20.0, 40.0)
 """Readings that count as one, to choose from."""
-_SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1), strict=True))
+_SIGNS = dict(zip(FEATURES, (1, -1, 1, 1, -1, -1, 1, 1, -1, -1, -1), strict=True))
 """Which way evidence points: a fit to few scenes must not turn it round."""
 _RIDGE = 1.0
 _PRIOR = {"margin": 0.5, "fit": -1.0, "gain": 1.0, "looked through": -1.0}
@@ -310,7 +312,7 @@ def _fit_spread(train: Sequence[Scene], scale: float) -> float:
     return float(np.median(ratios)) / 0.888
 
 
-def design(chosen: Sequence[Scene], hypothesis: float, scale: float) -> tuple[Floats, np.ndarray[Any, np.dtype[Any]]]:
+def design(chosen: Sequence[Scene], hypothesis: float, scale: float) -> tuple[Floats, Truths]:
     """Features of every instance, N x F, and whether it is right."""
     rows = [
         replace(item.evidence[str(scale)], hypothesis=float(scene.probabilities(hypothesis)[scene.winner])).features()
@@ -340,6 +342,10 @@ class Bin:
         return wilson(self.right, self.count)
 
 
+Bins = tuple[Sequence[Bin], Sequence[Bin]]
+"""Of poses and of winning hypotheses."""
+
+
 def wilson(right: int, count: int) -> tuple[float, float]:
     """Score interval of a share, 95 % (Wilson 1927)."""
     z = 1.959964
@@ -349,13 +355,13 @@ def wilson(right: int, count: int) -> tuple[float, float]:
     return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 
-def reliability(called: Floats, right: Floats, edges: Sequence[float] = _BINS) -> list[Bin]:
+def reliability(sure: Floats, right: Floats, edges: Sequence[float] = _BINS) -> list[Bin]:
     """Bins that hold something."""
     found: list[Bin] = []
     for low, high in pairwise(edges):
-        inside = (called >= low) & ((called < high) | (high == 1.0))
+        inside = (sure >= low) & ((sure < high) | (high == 1.0))
         if inside.any():
-            found.append(Bin(low, high, float(called[inside].mean()), int(right[inside].sum()), int(inside.sum())))
+            found.append(Bin(low, high, float(sure[inside].mean()), int(right[inside].sum()), int(inside.sum())))
     return found
 
 
@@ -377,47 +383,73 @@ def table(bins: Sequence[Bin]) -> str:
     return "\n".join([*lines, f"expected calibration error {expected_error(bins):.3f}"])
 
 
-def evaluate(test: Sequence[Scene], constants: Calibration) -> tuple[list[Bin], list[Bin]]:
+def called(chosen: Sequence[Scene], constants: Calibration) -> tuple[Floats, Truths]:
+    """What the constants call each instance, and whether it is right."""
+    X, right = design(chosen, constants.hypothesis_scale, constants.pose_scale)
+    return np.array([constants.probability(row) for row in X]), right
+
+
+def winners(chosen: Sequence[Scene], constants: Calibration) -> tuple[Floats, Truths]:
+    """How probable the winner is where there are several hypotheses, and whether it is the true set of objects."""
+    several = [scene for scene in chosen if len(scene.log_weights) > 1]
+    sure = [float(scene.probabilities(constants.hypothesis_scale)[scene.winner]) for scene in several]
+    return np.array(sure), np.array([scene.winner_right for scene in several], bool)
+
+
+def evaluate(chosen: Sequence[Scene], constants: Calibration) -> tuple[list[Bin], list[Bin]]:
     """Prints what the constants are worth on these scenes; the bins of the poses and those of the winners."""
-    X, right = design(test, constants.hypothesis_scale, constants.pose_scale)
-    called = np.array([constants.probability(row) for row in X])
-    bins = reliability(called, right)
-    print(f"\n{len(right)} objects in {len(test)} estimates, {right.mean():.1%} right\n{table(bins)}")
-    of = np.array([(scene.kind, scene.boxes) for scene in test for _ in scene.instances])
+    sure, right = called(chosen, constants)
+    bins = reliability(sure, right)
+    print(f"\n{len(right)} objects in {len(chosen)} estimates, {right.mean():.1%} right\n{table(bins)}")
+    of = np.array([(scene.kind, scene.boxes) for scene in chosen for _ in scene.instances])
     for kind, boxes in dict.fromkeys(map(tuple, of.tolist())):
-        chosen = (of[:, 0] == kind) & (of[:, 1] == boxes)
-        print(f"{kind:8} {boxes} boxes: called {called[chosen].mean():.3f}, right {right[chosen].mean():.3f} "
-              f"of {chosen.sum()}")  # fmt: skip
-    order = np.argsort(called)[: max(1, len(called) // 10)]
+        mine = (of[:, 0] == kind) & (of[:, 1] == boxes)
+        print(f"{kind:8} {boxes} boxes: called {sure[mine].mean():.3f}, right {right[mine].mean():.3f} of {mine.sum()}")
+    order = np.argsort(sure)[: max(1, len(sure) // 10)]
     print(f"the least sure tenth holds {np.sum(~right[order])} of {np.sum(~right)} errors")
-    return bins, _evaluate_winners(test, constants)
+    return bins, _evaluated_winners(*winners(chosen, constants))
 
 
-def _evaluate_winners(test: Sequence[Scene], constants: Calibration) -> list[Bin]:
-    several = [scene for scene in test if len(scene.log_weights) > 1]
-    if not several:
+def _evaluated_winners(sure: Floats, right: Truths) -> list[Bin]:
+    if not len(sure):
         return []
-    sure = np.array([float(scene.probabilities(constants.hypothesis_scale)[scene.winner]) for scene in several])
-    right = np.array([scene.winner_right for scene in several])
     bins = reliability(sure, right, _COARSE_BINS)
-    print(f"winning hypotheses: called {sure.mean():.3f}, right {right.mean():.3f} of {len(several)}\n{table(bins)}")
+    print(f"winning hypotheses: called {sure.mean():.3f}, right {right.mean():.3f} of {len(sure)}\n{table(bins)}")
     return bins
 
 
-def plot(poses: Sequence[Bin], winners: Sequence[Bin], path: Path) -> None:
-    """The reliability diagrams of poses and, where there were several hypotheses, of the winning ones."""
+def crossed(halves: Sequence[tuple[Sequence[Scene], Calibration]]) -> tuple[list[Bin], list[Bin]]:
+    """Prints the reliability over sets of scenes, each judged with constants that were fitted to the other."""
+    sure, right = _pooled([called(*half) for half in halves])
+    bins = reliability(sure, right)
+    print(f"\n{len(right)} objects of both sets, each judged with the constants of the other\n{table(bins)}")
+    return bins, _evaluated_winners(*_pooled([winners(*half) for half in halves]))
+
+
+def _pooled(parts: Sequence[tuple[Floats, Truths]]) -> tuple[Floats, Truths]:
+    return np.concatenate([sure for sure, _ in parts]), np.concatenate([right for _, right in parts])
+
+
+def plot(test: Bins, both: Bins, path: Path) -> None:
+    """The reliability diagrams of poses and, where there were several hypotheses, of the winning ones.
+
+    ``both`` are of all sets, each judged with the constants of the other.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    shown = [("Poses within 2 cm and 15 degrees (numbers: objects)", poses)]
-    shown += [("Winning hypotheses (numbers: images)", winners)] if winners else []
+    titles = "Poses within 2 cm and 15 degrees (numbers: objects)", "Winning hypotheses (numbers: images)"
+    shown = [each for each in zip(titles, test, both, strict=True) if each[1]]
     figure, axes = plt.subplots(
         1, len(shown), figsize=(5.2 * len(shown), 5.0), layout="constrained", sharey=True, squeeze=False
     )
-    for each, (title, bins) in zip(axes[0], shown, strict=True):
-        _draw(each, bins)
+    for each, (title, alone, pooled) in zip(axes[0], shown, strict=True):
+        each.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfect")
+        each.axvspan(0.85, 0.95, color="0.93", zorder=0)
+        _draw(each, alone, "#2c6fbb", "test set, 95 %", -0.004)
+        _draw(each, pooled, "#c7761d", "both sets, constants of the other", 0.004)
         each.set(xlabel="probability that was reported", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
     axes[0, 0].set(ylabel="share that is right")
     axes[0, 0].legend(loc="upper left", frameon=False)
@@ -426,16 +458,15 @@ def plot(poses: Sequence[Bin], winners: Sequence[Bin], path: Path) -> None:
     plt.close(figure)
 
 
-def _draw(axes: Any, bins: Sequence[Bin]) -> None:
-    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfect")
-    axes.axvspan(0.85, 0.95, color="0.93", zorder=0)
-    called = [each.called for each in bins]
+def _draw(axes: Any, bins: Sequence[Bin], color: str, label: str, aside: float) -> None:
+    sure = [each.called + aside for each in bins]
     right = np.array([each.right / each.count for each in bins])
     ends = np.array([each.interval for each in bins]).T
-    axes.errorbar(called, right, yerr=np.maximum(np.abs(ends - right), 0.0), fmt="o", color="#2c6fbb", capsize=3,
-                  label="test scenes, 95 %")  # fmt: skip
-    for each, x, y in zip(bins, called, right, strict=True):
-        axes.annotate(str(each.count), (x, y), textcoords="offset points", xytext=(7, -11), fontsize=8, color="0.35")
+    off = np.maximum(np.abs(ends - right), 0.0)
+    axes.errorbar(sure, right, yerr=off, fmt="o", color=color, capsize=3, label=label)
+    for each, x, y in zip(bins, sure, right, strict=True):
+        place = (7, -11) if aside > 0 else (-24, 4)
+        axes.annotate(str(each.count), (x, y), textcoords="offset points", xytext=place, fontsize=8, color=color)
 
 
 def write_constants(constants: Calibration, path: Path, command: str) -> None:
@@ -465,16 +496,17 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--evaluate", action="store_true", help="keep the constants that are there")
     options = parser.parse_args()
+    sets = {name: scenes(options.folder, name, options.most, options.processes) for name in _SEEDS}
     if not options.evaluate:
-        train = scenes(options.folder, "train", options.most, options.processes)
         command = "python -m benchmarks.calibration FOLDER" + (f" --most {options.most}" if options.most else "")
-        write_constants(fit(train), CONSTANTS, command)
+        write_constants(fit(sets["train"]), CONSTANTS, command)
         Calibration.load.cache_clear()
-        print("\nthe training sets:")
-        evaluate(train, Calibration.load())
-        print("\nthe test sets:")
-    test = scenes(options.folder, "test", options.most, options.processes)
-    plot(*evaluate(test, Calibration.load()), _PLOT)
+    constants = Calibration.load()
+    print("\nThe test set:", end="")
+    alone = evaluate(sets["test"], constants)
+    other = fit(sets["test"])
+    both = crossed([(sets["test"], constants), (sets["train"], other)])
+    plot(alone, both, _PLOT)
 
 
 if __name__ == "__main__":

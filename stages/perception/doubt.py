@@ -33,7 +33,7 @@ RIGHT_RADIANS = np.deg2rad(15.0)
 """A pose within these of the truth, modulo the object's symmetries, is right."""
 FEATURES = (
     "margin", "fit", "shown", "gain", "looked through", "spread", "hypothesis", "confidence", "unexplained", "sunk",
-    "agreement",
+    "penetration",
 )  # fmt: skip
 """What a probability is made of; :func:`Evidence.features`."""
 ORDINARY_NOISE = 0.00125
@@ -64,7 +64,7 @@ _OFF = 0.012
 """Metres along the ray, at one metre, beyond which a reading does not lie on a surface; grows with the square of depth
 as the noise of triangulation does."""
 _DEEPEST = 0.04
-"""Metres below the plane from which on an object lies as wrong as can be."""
+"""Metres in the plane or in another object from which on an object lies as wrong as can be."""
 _FARTHEST = 3.0
 _CAP = 12.0
 """Nats beyond which evidence is as good as any."""
@@ -144,6 +144,10 @@ class Judged:
     """Other poses that the estimator considered."""
     box: Floats | None = None
     """The detector's, x0, y0, x1, y1 in pixels; None where there was none."""
+    sunk: float = 0.0
+    """How far its lowest point lies below the plane, metres."""
+    penetration: float = 0.0
+    """How deep it and another object reach into each other, metres."""
 
 
 @dataclass(frozen=True)
@@ -170,10 +174,10 @@ class Evidence:
     confidence: float
     sunk: float = 0.0
     """How far its lowest point lies below the plane, metres."""
+    penetration: float = 0.0
+    """How deep it and another object reach into each other, metres."""
     unexplained: float = 0.0
     """Share of the foreground readings in its box that no object of the scene explains."""
-    agreement: float = 1.0
-    """Intersection over union of its box and of that of its silhouette in front of the other objects."""
     noise: float = ORDINARY_NOISE
     """How far readings of the plane lie from it, metres."""
 
@@ -191,7 +195,7 @@ class Evidence:
             self.confidence,
             self.unexplained,
             min(self.sunk, _DEEPEST) / RIGHT_METRES,
-            self.agreement,
+            min(self.penetration, _DEEPEST) / RIGHT_METRES,
         ])  # fmt: skip
 
 
@@ -251,8 +255,10 @@ def judged(item: ObjectPose, refined: RefinedObject) -> Judged:
     mine, *others = refined.considered or (None,)
     own = None if mine is None else mine.colour
     rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
-    rivals = tuple(Rival(*rival) for rival in rivals)
-    return Judged(refined.label, refined.T_camera_object, item.confidence, rivals, item.box)
+    return Judged(
+        refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals), item.box,
+        sunk=refined.sunk, penetration=refined.penetration,
+    )  # fmt: skip
 
 
 def annotated(estimate: SceneEstimate, doubt: SceneDoubt) -> SceneEstimate:
@@ -399,8 +405,8 @@ class _Look:
             breadth=max(max(near_metres, wide_metres) / RIGHT_METRES, max(near_radians, wide_radians) / RIGHT_RADIANS),
             hypothesis=hypothesis,
             confidence=item.confidence,
-            sunk=self._sunk(),
-            agreement=self._agreement(item.box),
+            sunk=item.sunk,
+            penetration=item.penetration,
         )
         kept = cells[: min(likely, _KEPT)]
         return evidence, Others(probes[away][kept], np.minimum(weights[: len(kept)], 1.0))
@@ -474,24 +480,6 @@ class _Look:
         count = float(len(distances) / self._stride**2)
         gain = float((self._likelihood.base - own) / (form.truncation * max(1.0, count)))
         return fit, count, float(shown.sum() / max(1, silhouette.sum())), gain
-
-    def _sunk(self) -> float:
-        """How far the lowest point of the object lies below the plane, metres."""
-        points = rotate(self._pose[:, :3], self._model.shape.support.astype(float)) + self._pose[:, 3]
-        plane = self._scene.plane.astype(float)
-        return max(0.0, -float(((points * plane[:3]).sum(-1) + plane[3]).min()))
-
-    def _agreement(self, box: Floats | None) -> float:
-        """Intersection over union of a box and of that of what no other object hides."""
-        shown = (self._layer > 0) & (self._layer >= self._others)
-        if box is None or not shown.any():
-            return float(box is None)
-        columns, rows = np.flatnonzero(shown.any(0)), np.flatnonzero(shown.any(1))
-        mine = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
-        low, high = np.maximum(mine[:2], box[:2]), np.minimum(mine[2:], box[2:])
-        both = float(np.maximum(high - low, 0.0).prod())
-        either = sum(float(np.maximum(each[2:] - each[:2], 0.0).prod()) for each in (mine, box)) - both
-        return both / max(either, 1.0)
 
     @property
     def _stride(self) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stages.perception.colour import Contender, Paint, Verdict, judge
 from stages.perception.composition import fit, scene_cost
-from stages.perception.contact import Solid, apparent, contacts, penalty
+from stages.perception.contact import Contacts, Solid, apparent, contacts, penalty
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.particle_filter import FilterSettings, Rectangle
 from stages.perception.poses import symmetry_angle
@@ -107,6 +107,10 @@ class RefinedObject:
     """Share of its silhouette that nothing hides."""
     considered: tuple[Considered, ...]
     """The poses that depth found equal: the chosen one first, then the others, cheapest first."""
+    penetration: float = 0.0
+    """How deep it and another object reach into each other, metres."""
+    sunk: float = 0.0
+    """How far its lowest point lies below the plane, metres."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +222,9 @@ class _Joint:
 
     def result(self) -> RefinedScene:
         """The scene as it stands."""
-        found = tuple(self._found(i) for i in range(len(self._models)))
+        touching = contacts([model.solid for model in self._models], np.reshape(self._poses, (-1, 3, 4)),
+                            self._scene.T_camera_table)  # fmt: skip
+        found = tuple(self._found(i, touching) for i in range(len(self._models)))
         return RefinedScene(found, scene_cost(self._scene, self._layers, self._settings.cost))
 
     def _polish(self, i: int) -> bool:
@@ -310,10 +316,13 @@ class _Joint:
         found = contacts(solids, poses, self._scene.T_camera_table)
         return penalty(found, apparent(solids, poses, self._scene.view.fx))
 
-    def _found(self, i: int) -> RefinedObject:
+    def _found(self, i: int, touching: Contacts) -> RefinedObject:
         others = [self._scene.plane_inverse, *(layer for j, layer in enumerate(self._layers) if j != i)]
         cost, visible = fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
-        return RefinedObject(self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i])
+        return RefinedObject(
+            self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i],
+            penetration=float(touching.penetration[i].max()), sunk=float(touching.sunk[i]),
+        )  # fmt: skip
 
     def _move(self, i: int, pose: Floats) -> None:
         self._poses[i] = pose

@@ -11,6 +11,7 @@ from benchmarks.calibration import (
     POSE_SCALES,
     Instance,
     Scene,
+    crossed,
     design,
     evaluate,
     expected_error,
@@ -72,6 +73,13 @@ def test_a_fit_predicts_scenes_that_it_has_not_seen(capsys: pytest.CaptureFixtur
     assert "800 objects in 800 estimates" in printed and "the least sure tenth" in printed
 
 
+def test_two_sets_are_judged_with_the_constants_of_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    one, two = synthetic(300, 7), synthetic(300, 8)
+    poses, images = crossed([(one, fit(two)), (two, fit(one))])
+    assert sum(each.count for each in poses) == sum(each.count for each in images) == 600
+    assert expected_error(poses) < 0.06 and "600 objects of both sets" in capsys.readouterr().out
+
+
 def test_evidence_never_turns_round() -> None:
     # Confidence speaks against in these few scenes; the fit does not believe it.
     scenes = synthetic(40, 3)
@@ -99,7 +107,7 @@ def test_the_reliability_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib comes with the extra `benchmarks`")
     bins = reliability(np.array([0.2, 0.9, 0.95]), np.array([False, True, True]))
     for winners in (bins, []):
-        plot(bins, winners, tmp_path / "figures" / f"{len(winners)}.png")
+        plot((bins, winners), (bins, winners), tmp_path / "figures" / f"{len(winners)}.png")
     one, two = ((tmp_path / "figures" / f"{count}.png").stat().st_size for count in (0, len(bins)))
     assert 5000 < one < two
 
