@@ -1,0 +1,1 @@
+"""How fast messages travel: the runner beside bare Zenoh and dora-rs."""
