@@ -12,11 +12,14 @@ import numpy as np
 
 from stages.perception.cuda_kernels import evaluate
 from stages.perception.cuda_math import SIMULATED, cuda
-from stages.perception.likelihood import CostForm, Shape, Window
+from stages.perception.cuda_refine import refine
+from stages.perception.likelihood import CostForm, ObjectLikelihood, Shape, Window
 from stages.perception.rasteriser import LANES, Float32s, Soup
+from stages.scene.catalogue import Floats
 
-THREADS = 128
-"""Per particle; a power of two. Sums are taken in this many strands, so another number changes the last bits."""
+THREADS = 2 if SIMULATED else 128
+"""Per particle; a power of two. Sums are taken in this many strands, so another number changes the last bits. In the
+simulator each is a thread of Python."""
 Z_BUFFER_BYTES = 32 * 1024
 """Shared memory for a particle's z-buffer, at most 47 KB: seven blocks fit on a multiprocessor of a Hopper card at
 once, and rectangles up to 90 x 90 pixels are drawn in one go."""
@@ -31,6 +34,11 @@ class Look:
     window: Window
     plane: Float32s
     form: CostForm
+
+    @staticmethod
+    def of(likelihood: ObjectLikelihood) -> Look:
+        """What a likelihood compares with."""
+        return Look(likelihood.window, likelihood.plane, likelihood.form)
 
 
 @dataclass(frozen=True)
@@ -57,10 +65,13 @@ class Batch:
         self.bases = np.array([look.window.credit.sum(dtype=np.float64) for look in looks])
         """Cost of each window without the object, W, metres times pixels."""
         widest = max(look.window.view.width for look in looks)
-        words = max(self.launch.z_buffer_bytes // 4, widest)
+        # Polish looks at the rows above and below.
+        words = max(self.launch.z_buffer_bytes // 4, 3 * widest)
         words = min(words, max(look.window.factor.size for look in looks))
         self._shared_bytes = 4 * (words + self.launch.threads)
         self._room: list[Any] = []
+        self.middles = put(np.array([[*shape.centre, shape.diameter] for shape in shapes]), np.float32)
+        """Centre and diameter of each mesh, M x 4, on the device."""
 
     def write_costs(self, poses: Any, objects: Any, windows: Any, out: Any, *, stream: Any = 0) -> None:
         """Changes of cost, P, for poses P x 3 x 4 float32 of objects P and windows P (int32); all on the device.
@@ -70,6 +81,35 @@ class Batch:
         """
         arrays = [_in_place(array) for array in (poses, objects, windows, out)]
         evaluate[len(poses), self.launch.threads, stream, self._shared_bytes](*self._meshes, *self._windows, *arrays)
+
+    def polish(
+        self,
+        poses: Any,
+        objects: Any,
+        windows: Any,
+        directions: Any,
+        counts: Any,
+        *,
+        most: int,
+        steps: int,
+        gate: float,
+        stream: Any = 0,
+    ) -> None:
+        """Moves in place the first of each of H populations by Gauss-Newton steps, ``counts[h]`` and at ``most`` so
+        many; all on the device, poses H N x 3 x 4, directions H x 6 x D. Returns before the device has finished."""
+        refine[(most, len(counts)), self.launch.threads, stream, self._shared_bytes](
+            *self._meshes[:3], self.middles, *self._windows[:3], directions, poses, objects, windows, counts,
+            np.int32(steps), np.float64(gate),
+        )  # fmt: skip
+
+    def refined(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
+        """Poses given on the host after Gauss-Newton steps, K x 3 x 4, of the first mesh in the first window."""
+        none = put(np.zeros(len(poses)), np.int32)
+        moved, counts = put(poses, np.float32), put(np.array([len(poses)]), np.int32)
+        if len(poses):
+            self.polish(moved, none, none, put(directions[None], np.float32), counts, most=len(poses), steps=steps,
+                        gate=gate)  # fmt: skip
+        return moved.copy_to_host().astype(float)
 
     def costs(self, poses: Any, objects: Any, windows: Any) -> Float32s:
         """Changes of cost of poses given on the host, P."""
@@ -82,6 +122,14 @@ class Batch:
         self.write_costs(*places)
         return places[-1].copy_to_host()
 
+    def changes(self, poses: Floats) -> Float32s:
+        """What ``kernels.change_of_cost`` writes, P, for the first mesh in the first window.
+
+        Equal up to rounding, not byte by byte: the CPU adds along rows what the GPU adds in strands.
+        """
+        none = np.zeros(len(poses), np.int32)
+        return self.costs(poses, none, none)
+
     def _buffers(self, count: int) -> list[Any]:
         """Room on the device for poses, objects, windows and costs; to allocate it each time would cost more than the
         kernel."""
@@ -89,15 +137,6 @@ class Batch:
             shapes = (((count, 3, 4), np.float32), (count, np.int32), (count, np.int32), (count, np.float32))
             self._room = [cuda.device_array(*shape) for shape in shapes]
         return self._room
-
-
-def change_of_cost_cuda(batch: Batch, poses: Any) -> Float32s:
-    """What ``kernels.change_of_cost`` writes, for a batch of one mesh and one window; P x 3 x 4 -> P.
-
-    Equal up to rounding, not byte by byte: the CPU adds along rows what the GPU adds in strands.
-    """
-    none = np.zeros(len(poses), np.int32)
-    return batch.costs(poses, none, none)
 
 
 def _in_place(array: Any) -> Any:
@@ -120,7 +159,12 @@ def _meshes(shapes: Sequence[Shape], launch: Launch) -> list[Any]:
         np.stack([shape.soup.corners for shape in shapes]),
         np.concatenate([shape.support for shape in shapes]),
     )
-    return [cuda.to_device(np.ascontiguousarray(array)) for array in arrays]
+    return [put(array, array.dtype) for array in arrays]
+
+
+def put(array: Any, kind: Any) -> Any:
+    """A copy on the device."""
+    return cuda.to_device(np.ascontiguousarray(array, kind))
 
 
 def _team(soup: Soup, threads: int) -> int:
@@ -142,7 +186,7 @@ def _windows(looks: Sequence[Look]) -> list[Any]:
         np.stack([look.plane for look in looks]).astype(np.float32),
         np.array([limits(look.form) for look in looks], np.float32),
     )
-    return [cuda.to_device(np.ascontiguousarray(array)) for array in arrays]
+    return [put(array, array.dtype) for array in arrays]
 
 
 def limits(form: CostForm) -> list[float]:

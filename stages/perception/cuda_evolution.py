@@ -1,8 +1,9 @@
 """CUDA kernel of the filter's other half: weights, resampling and transition, one block per population.
 
-Together with ``evaluate`` it is a whole iteration: what one launch writes the next reads, and the schedule's step is
-kept on the device, so the host queues iterations without waiting for any of them. Sums run in one fixed order and
-random numbers come from counters: equal seeds give equal bytes on the same kind of device.
+With ``evaluate`` before it and ``refine`` after it, it is a whole iteration: what one launch writes the next reads,
+and the schedule's step, the number of particles and whether a population has settled are kept on the device, so the
+host queues iterations without waiting for any of them. Sums run in one fixed order and random numbers come from
+counters and each population's own seed: equal seeds give equal bytes on the same kind of device, alone or in company.
 """
 
 # ruff: noqa: PLR0917
@@ -16,9 +17,10 @@ import math
 import numba
 import numpy as np
 
-from stages.perception.cuda_kernels import block_greatest, block_sum
+from stages.perception.cuda_kernels import NOTHING, block_greatest, block_sum
 from stages.perception.cuda_math import cuda
 from stages.perception.cuda_random import normals, uniforms
+from stages.perception.evolution import PROGRESS, THINNED
 from stages.perception.likelihood import _SLACK, _STRAY
 
 _f = np.float32
@@ -28,55 +30,96 @@ _NEAR = np.float32(0.05)
 _PI = np.float32(np.pi)
 _TINY = np.float32(1e-12)
 _SLACK32, _STRAY32 = np.float32(_SLACK), np.float32(_STRAY)
+_PROGRESS = np.float32(PROGRESS)
 _BISECTIONS = 24
 
 MESH, WINDOW, FIRST_FLIP, FLIPS = range(4)
 """Columns of the table of populations."""
-BOX, REACH, BASE, PRIOR = 0, 4, 6, 7
-"""Columns of the table of windows: box (4), depths (2), cost without the object, whether the box is a prior."""
-METRES, RADIANS, RENEWED = range(3)
-"""Columns of the schedule, one row per iteration."""
-EFFECTIVE, SCALE, FLIPPED, ELITISM = range(4)
+VIEW, BOX, REACH, BASE, PRIOR = 0, 6, 10, 12, 13
+"""Columns of the table of windows: view (6), box (4), depths (2), cost without the object, whether a box is a prior."""
+METRES, RADIANS = range(2)
+"""Columns of the schedule's spreads, one row per iteration."""
+COUNT, STRIDE, FLIPPED, RENEWED, FIRST_FRESH, POLISHED = range(6)
+"""Columns of the schedule's numbers, one row per iteration: particles of the next generation, how far apart in the
+order of resampling its neighbours are (coprime to COUNT), and how many are flipped, renewed (from which place of the
+pool on) and polished."""
+EFFECTIVE, SCALE, ELITISM, PATIENCE, SPINS = range(5)
 """Places of the settings; a scale of 0 is chosen in each iteration."""
+SIZE, STEP, STALE, DONE = range(4)
+"""Columns of the populations' state: particles, iterations done, those without progress, whether it has settled."""
 _OFFSET, _KIND, _TURNS, _SHIFTS = range(4)
 """Purposes of random numbers."""
 
 
 @cuda.jit
-def evolve(changes, poses, following, populations, middles, views, windows, flips, directions, pools, schedule,
-           settings, seed, steps, history):  # fmt: skip
-    """Writes the next generation of each population and the energy of its best particle."""
+def evolve(changes, poses, following, objects, populations, middles, axes, windows, flips, directions, pools, spreads,
+           numbers, settings, seeds, state, polished, history, traces):  # fmt: skip
+    """Writes the next generation of each population, and keeps of this one the least cost and some positions.
+
+    A population that has settled stays as it is, and its places are marked so that nothing more is weighed.
+    """
     h = cuda.blockIdx.x
-    count = poses.shape[0] // populations.shape[0]
-    first, step, who = h * count, steps[h], populations[h]
-    stage = schedule[min(step, schedule.shape[0] - 1)]
-    middle = middles[who[MESH]]
-    least = _energies(changes, poses, first, count, middle, views[who[WINDOW]], windows[who[WINDOW]])
-    champion = _champion(least, count)
-    total = _accumulate(least, _scale(least, count, settings), count)
-    offset, _, _, _ = uniforms(0, step, h, _OFFSET, seed)
-    for i in range(cuda.threadIdx.x, count, cuda.blockDim.x):
-        source = poses[first + _drawn((offset + _f(i)) / _f(count) * total, count)]
+    capacity = poses.shape[0] // populations.shape[0]
+    first, size, step, who = h * capacity, state[h, SIZE], state[h, STEP], populations[h]
+    if state[h, DONE] > 0:
+        _rest(poses, following, objects, first, size, polished, h)
+        return
+    middle, window, plan = middles[who[MESH]], windows[who[WINDOW]], numbers[step]
+    count = plan[COUNT]
+    least = _energies(changes, poses, first, size, middle, window)
+    champion = _champion(least, size)
+    total = _accumulate(least, _scale(least, size, settings[EFFECTIVE] * _f(count), settings[SCALE]), size)
+    offset, turn, _, _ = uniforms(0, step, 0, _OFFSET, seeds[h])
+    for i in range(cuda.threadIdx.x, size, cuda.blockDim.x):
+        if i % THINNED == 0:
+            for row in range(3):
+                traces[h, step, i // THINNED, row] = poses[first + i, row, 3]
+    for i in range(cuda.threadIdx.x, capacity, cuda.blockDim.x):
+        objects[first + i] = who[MESH] if i < count else NOTHING
+        if i >= count:
+            continue
+        # Neighbours in the order of resampling are copies of each other: to flip the first few places would flip few.
+        place = (i * plan[STRIDE] + _i(turn * _f(count))) % count
+        source = poses[first + _drawn((offset + _f(place)) / _f(count) * total, size)]
         target = following[first + i]
-        kind, which, angle, _ = uniforms(i, step, h, _KIND, seed)
         if settings[ELITISM] > _ZERO and i == count - 1:
             _copy(poses[first + champion], target)
-        elif kind < settings[FLIPPED] * _HALF:
-            _flip(source, target, middle, flips[who[FIRST_FLIP] + _i(which * _f(who[FLIPS]))])
-        elif kind < settings[FLIPPED]:
-            _spin(source, target, middle, _i(which * _f(3)), (angle * _f(2) - _ONE) * _PI)
-        elif kind < settings[FLIPPED] + stage[RENEWED]:
-            _copy(pools[h, _i(which * _f(pools.shape[1]))], target)
+        elif i >= count - plan[RENEWED]:
+            _copy(pools[h, plan[FIRST_FRESH] + i - (count - plan[RENEWED])], target)
         else:
-            _diffuse(source, target, middle, directions[h], stage, i, step, h, seed)
+            _diffuse(source, target, middle, directions[h], spreads[step], i, step, seeds[h])
+            if i < plan[FLIPPED]:
+                _flip_or_spin(target, middle, axes[h], flips, who, settings, i, step, seeds[h])
     cuda.syncthreads()
     if cuda.threadIdx.x == 0:
-        history[h, min(step, history.shape[1] - 1)] = least
-        steps[h] = step + 1
+        _record(h, window[BASE], least, plan, settings, state, polished, history)
 
 
 @cuda.jit(device=True)
-def _energies(changes, poses, first, count, middle, view, window):
+def _rest(poses, following, objects, first, size, polished, h):
+    """Takes a population that has settled over as it is."""
+    for i in range(cuda.threadIdx.x, size, cuda.blockDim.x):
+        _copy(poses[first + i], following[first + i])
+        objects[first + i] = NOTHING
+    if cuda.threadIdx.x == 0:
+        polished[h] = 0
+
+
+@cuda.jit(device=True)
+def _record(h, base, least, plan, settings, state, polished, history):
+    """Ends a population's iteration: the least cost, whether that was progress, and whether more is to come of it."""
+    step, cost, best = state[h, STEP], base + least, _f(np.inf)
+    for i in range(step):
+        best = min(best, history[h, i])
+    stale = 0 if cost < _PROGRESS * best else state[h, STALE] + 1
+    history[h, step] = cost
+    polished[h] = plan[POLISHED]
+    state[h, SIZE], state[h, STEP], state[h, STALE] = plan[COUNT], step + 1, stale
+    state[h, DONE] = 1 if min(best, cost) < base and _f(stale) >= settings[PATIENCE] else 0
+
+
+@cuda.jit(device=True)
+def _energies(changes, poses, first, count, middle, window):
     """Keeps each particle's energy in shared memory, after the words for sums; returns the least."""
     energies = cuda.shared.array(0, numba.float32)
     least = _f(np.inf)
@@ -84,20 +127,20 @@ def _energies(changes, poses, first, count, middle, view, window):
         energy = changes[first + i]
         if window[PRIOR] > _ZERO:
             unseen = _ONE if energy == _ZERO else _ZERO
-            energy += window[BASE] * (_STRAY32 * _stray(poses[first + i], middle, view, window) + unseen)
+            energy += window[BASE] * (_STRAY32 * _stray(poses[first + i], middle, window) + unseen)
         energies[cuda.blockDim.x + i] = energy
         least = min(least, energy)
     return -block_greatest(-least)
 
 
 @cuda.jit(device=True)
-def _stray(pose, middle, view, window):
+def _stray(pose, middle, window):
     """``ObjectLikelihood``'s prior: how far the centre is from where box and readings allow it, in diameters."""
     x, y, z = _rotated(pose, middle[0], middle[1], middle[2])
     x, y, z = x + pose[0, 3], y + pose[1, 3], max(z + pose[2, 3], _NEAR)
-    apparent = middle[3] * view[0] / z
-    beside = _outside(x / z * view[0] + view[2], window[0], window[2], apparent)
-    below = _outside(y / z * view[1] + view[3], window[1], window[3], apparent)
+    apparent = middle[3] * window[VIEW] / z
+    beside = _outside(x / z * window[VIEW] + window[VIEW + 2], window[BOX], window[BOX + 2], apparent)
+    below = _outside(y / z * window[VIEW + 1] + window[VIEW + 3], window[BOX + 1], window[BOX + 3], apparent)
     half = middle[3] * _HALF
     beyond = max(window[REACH] - half - z, z - window[REACH + 1] - half) / middle[3] - _SLACK32
     return _share(beside) + _share(below) + _share(beyond)
@@ -127,15 +170,15 @@ def _champion(least, count):
 
 
 @cuda.jit(device=True)
-def _scale(least, count, settings):
+def _scale(least, count, effective, given):
     """lambda_r of equation 8: as given, or by bisection for the wished effective sample size."""
-    if settings[SCALE] > _ZERO:
-        return settings[SCALE]
+    if given > _ZERO:
+        return given
     low, high = _f(-12), _f(12)
     for _ in range(_BISECTIONS):
         middle = (low + high) * _HALF
         total, squares = _weight_sums(least, _f(math.exp(middle)), count)
-        if total * total > settings[EFFECTIVE] * _f(count) * squares:
+        if total * total > effective * squares:
             low = middle
         else:
             high = middle
@@ -199,38 +242,53 @@ def _copy(source, target):
 
 
 @cuda.jit(device=True)
-def _flip(source, target, middle, flip):
-    """Turns an object about its centre by a rotation in its own frame."""
+def _flip_or_spin(pose, middle, axes, flips, who, settings, particle, step, seed):
+    """One flip, in place; every second particle is turned by any angle about one of the object's axes instead, where
+    objects are free to."""
+    which, angle, _, _ = uniforms(particle, step, 0, _KIND, seed)
+    if settings[SPINS] > _ZERO and particle % 2 == 1:
+        _spin(pose, middle, axes, _i(which * _f(3)), (angle * _f(2) - _ONE) * _PI)
+    else:
+        _flip(pose, middle, flips[who[FIRST_FLIP] + _i(which * _f(who[FLIPS]))])
+
+
+@cuda.jit(device=True)
+def _flip(pose, middle, flip):
+    """Turns an object about its centre by a rotation in its own frame, in place."""
+    before = _rotated(pose, middle[0], middle[1], middle[2])
     for row in range(3):
+        a, b, c = pose[row, 0], pose[row, 1], pose[row, 2]
         for column in range(3):
-            target[row, column] = (source[row, 0] * flip[0, column] + source[row, 1] * flip[1, column]
-                                   + source[row, 2] * flip[2, column])  # fmt: skip
-    _centre(source, target, middle, _ZERO, _ZERO, _ZERO)
+            pose[row, column] = a * flip[0, column] + b * flip[1, column] + c * flip[2, column]
+    _centre(pose, pose, before, middle, _ZERO, _ZERO, _ZERO)
 
 
 @cuda.jit(device=True)
-def _spin(source, target, middle, axis, angle):
-    """Turns an object about its centre and one of its axes."""
-    _turn(source, target, angle * source[0, axis], angle * source[1, axis], angle * source[2, axis])
-    _centre(source, target, middle, _ZERO, _ZERO, _ZERO)
+def _spin(pose, middle, axes, axis, angle):
+    """Turns an object about its centre and one of its axes, in place."""
+    before = _rotated(pose, middle[0], middle[1], middle[2])
+    x, y, z = _rotated(pose, axes[0, axis], axes[1, axis], axes[2, axis])
+    _turn(pose, pose, angle * x, angle * y, angle * z)
+    _centre(pose, pose, before, middle, _ZERO, _ZERO, _ZERO)
 
 
 @cuda.jit(device=True)
-def _diffuse(source, target, middle, directions, stage, particle, step, population, seed):
+def _diffuse(source, target, middle, directions, spread, particle, step, seed):
     """Gaussian noise in every direction of freedom: the transition of Iterated Likelihood Weighting."""
     noise = cuda.local.array(8, numba.float32)
-    noise[0], noise[1], noise[2], noise[3] = normals(particle, step, population, _TURNS, seed)
-    noise[4], noise[5], noise[6], noise[7] = normals(particle, step, population, _SHIFTS, seed)
+    noise[0], noise[1], noise[2], noise[3] = normals(particle, step, 0, _TURNS, seed)
+    noise[4], noise[5], noise[6], noise[7] = normals(particle, step, 0, _SHIFTS, seed)
     twist = cuda.local.array(6, numba.float32)
     for row in range(6):
         twist[row] = _ZERO
     for k in range(directions.shape[1]):
         turning = abs(directions[0, k]) + abs(directions[1, k]) + abs(directions[2, k]) > _ZERO
-        size = noise[k] * (stage[RADIANS] if turning else stage[METRES])
+        size = noise[k] * (spread[RADIANS] if turning else spread[METRES])
         for row in range(6):
             twist[row] += directions[row, k] * size
+    before = _rotated(source, middle[0], middle[1], middle[2])
     _turn(source, target, twist[0], twist[1], twist[2])
-    _centre(source, target, middle, twist[3], twist[4], twist[5])
+    _centre(source, target, before, middle, twist[3], twist[4], twist[5])
 
 
 @cuda.jit(device=True)
@@ -248,9 +306,8 @@ def _turn(source, target, x, y, z):
 
 
 @cuda.jit(device=True)
-def _centre(source, target, middle, x, y, z):
-    """Puts the centre of a turned object where it was, and shifts it."""
-    before = _rotated(source, middle[0], middle[1], middle[2])
+def _centre(source, target, before, middle, x, y, z):
+    """Puts the centre of a turned object where it was, ``before`` from its origin, and shifts it."""
     after = _rotated(target, middle[0], middle[1], middle[2])
     target[0, 3] = source[0, 3] + before[0] - after[0] + x
     target[1, 3] = source[1, 3] + before[1] - after[1] + y

@@ -13,6 +13,8 @@ the bands, nor the teams, nor the order in which threads run change a byte.
 
 from __future__ import annotations
 
+import operator
+
 import numba
 import numpy as np
 
@@ -40,19 +42,47 @@ _IMPOSSIBLE = np.float32(IMPOSSIBLE)
 _BLOCK = 9 * LANES
 """Values per block of triangles."""
 
+NOTHING = -1
 FIRST_BLOCK, BLOCKS, FIRST_SUPPORT, SUPPORTS, TEAM = range(5)
 """Columns of the table of meshes."""
+
+
+def _reduction(combine):
+    """A device function that combines a value of every thread, by halves: the same order in every run."""
+
+    @cuda.jit(device=True)
+    def reduced(value):
+        shared = cuda.shared.array(0, numba.float32)
+        shared[cuda.threadIdx.x] = value
+        half = cuda.blockDim.x // 2
+        while half > 0:
+            cuda.syncthreads()
+            if cuda.threadIdx.x < half:
+                shared[cuda.threadIdx.x] = combine(shared[cuda.threadIdx.x], shared[cuda.threadIdx.x + half])
+            half //= 2
+        cuda.syncthreads()
+        result = shared[0]
+        cuda.syncthreads()
+        return result
+
+    return reduced
+
+
+block_sum = _reduction(operator.add)
+block_greatest = _reduction(max)
 
 
 @cuda.jit
 def evaluate(lanes, meshes, corners, support, views, firsts, pixels, planes, limits, poses, objects, windows, out):
     """Writes for each particle what ``change_of_cost`` writes on the CPU: block p weighs pose p of mesh
-    ``objects[p]`` in window ``windows[p]``."""
+    ``objects[p]`` in window ``windows[p]``. Places whose object is ``NOTHING`` are passed over."""
     p = cuda.blockIdx.x
+    if objects[p] == NOTHING:
+        return
     mesh, view = meshes[objects[p]], views[windows[p]]
     bound = limits[windows[p]]
     m = screen_matrix(poses[p], view)
-    x0, y0, x1, y1, nearest = _rectangle(corners[objects[p]], m, view)
+    x0, y0, x1, y1, nearest = rectangle(corners[objects[p]], m, view)
     if nearest < _NEAR:
         if cuda.threadIdx.x == 0:
             out[p] = _IMPOSSIBLE
@@ -67,7 +97,7 @@ def evaluate(lanes, meshes, corners, support, views, firsts, pixels, planes, lim
 
 
 @cuda.jit(device=True)
-def _rectangle(corners, m, view):
+def rectangle(corners, m, view):
     """First and last pixel x0, y0, x1, y1 that the enclosing box may touch, and the depth of its nearest corner."""
     u0 = v0 = nearest = _FAR
     u1 = v1 = -_FAR
@@ -103,7 +133,7 @@ def _visible(lanes, mesh, m, box, view, first_pixel, pixels, bound):
         for i in range(cuda.threadIdx.x, (bottom - top) * columns, cuda.blockDim.x):
             z_buffer[reserved + i] = 0
         cuda.syncthreads()
-        _draw(lanes, mesh, m, box, top, bottom, columns)
+        draw(lanes, mesh, m, box, top, bottom, columns)
         cuda.syncthreads()
         total = _scan(total, box, top, bottom, columns, view, first_pixel, pixels, bound)
         cuda.syncthreads()
@@ -111,7 +141,7 @@ def _visible(lanes, mesh, m, box, view, first_pixel, pixels, bound):
 
 
 @cuda.jit(device=True)
-def _draw(lanes, mesh, m, box, top, bottom, columns):
+def draw(lanes, mesh, m, box, top, bottom, columns):
     """Writes the greatest inverse depth of the triangles into rows [top, bottom) of the rectangle."""
     team = mesh[TEAM]
     for triangle in range(cuda.threadIdx.x // team, mesh[BLOCKS] * LANES, cuda.blockDim.x // team):
@@ -164,37 +194,3 @@ def _scan(total, box, top, bottom, columns, view, first_pixel, pixels, bound):
         if column >= columns:
             row, column = row + 1, column - columns
     return total
-
-
-@cuda.jit(device=True)
-def block_sum(value):
-    """The sum over all threads, by halves: the same order in every run."""
-    shared = cuda.shared.array(0, numba.float32)
-    shared[cuda.threadIdx.x] = value
-    half = cuda.blockDim.x // 2
-    while half > 0:
-        cuda.syncthreads()
-        if cuda.threadIdx.x < half:
-            shared[cuda.threadIdx.x] += shared[cuda.threadIdx.x + half]
-        half //= 2
-    cuda.syncthreads()
-    result = shared[0]
-    cuda.syncthreads()
-    return result
-
-
-@cuda.jit(device=True)
-def block_greatest(value):
-    """The greatest value over all threads."""
-    shared = cuda.shared.array(0, numba.float32)
-    shared[cuda.threadIdx.x] = value
-    half = cuda.blockDim.x // 2
-    while half > 0:
-        cuda.syncthreads()
-        if cuda.threadIdx.x < half:
-            shared[cuda.threadIdx.x] = max(shared[cuda.threadIdx.x], shared[cuda.threadIdx.x + half])
-        half //= 2
-    cuda.syncthreads()
-    result = shared[0]
-    cuda.syncthreads()
-    return result

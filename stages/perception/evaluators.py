@@ -6,21 +6,29 @@ device; ``auto`` replays to the same bytes only where the same kind of device is
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from runner.contract import Refused
 from stages.scene.catalogue import Floats
 
 if TYPE_CHECKING:
-    from stages.perception.likelihood import CostForm, Shape, Window
+    from stages.perception.likelihood import ObjectLikelihood
     from stages.perception.rasteriser import Float32s
-
-    Evaluator = Callable[[Floats], Float32s]
-    """Changes of cost, P, of poses P x 3 x 4 of one object in one window."""
 
 Device = Literal["cpu", "cuda"]
 DEVICES = ("auto", "cpu", "cuda")
+
+
+class Evaluator(Protocol):
+    """What a device does with poses P x 3 x 4 of one object in one window."""
+
+    def changes(self, poses: Floats) -> Float32s:
+        """Changes of cost, P."""
+        ...
+
+    def refined(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
+        """Poses after Gauss-Newton steps, as ``ObjectLikelihood.refine``."""
+        ...
 
 
 def chosen_device(device: str, *, place: str) -> Device:
@@ -50,9 +58,8 @@ def cuda_obstacle() -> str | None:
     return f"numba finds no GPU ({reason})"
 
 
-def cuda_evaluator(shape: Shape, window: Window, plane: Float32s, form: CostForm) -> Evaluator:
-    """The GPU's changes of cost; mesh and window stay on the device as long as the evaluator lives."""
-    from stages.perception.cuda_batch import Batch, Look, change_of_cost_cuda
+def cuda_evaluator(likelihood: ObjectLikelihood) -> Evaluator:
+    """The GPU's costs and polish of one object in one window; both stay on the device as long as this lives."""
+    from stages.perception.cuda_batch import Batch, Look
 
-    batch = Batch([shape], [Look(window, plane, form)])
-    return lambda poses: change_of_cost_cuda(batch, poses)
+    return Batch([likelihood.shape], [Look.of(likelihood)])

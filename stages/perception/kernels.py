@@ -106,12 +106,12 @@ def gauss_newton(lanes, blocks, corners, centre, poses, steps, gate, view, backg
                                      observed, factor, middle, reach, directions, A, b, row)  # fmt: skip
             if used < 12:
                 break
-            _solve(A, b)
+            solve(A, b)
             for i in range(6):
                 twist[i] = 0.0
                 for j in range(degrees):
                     twist[i] += directions[i, j] * b[j]
-            _move(poses[p], middle, twist)
+            move(poses[p], middle, twist)
             reach = max(0.8 * reach, 0.005)
 
 
@@ -130,21 +130,11 @@ def _normal_equations(Z, x0, y0, columns, rows, view, background, observed, fact
             i = v * columns + u
             q, left, right, up, down = Z[i], Z[i - 1], Z[i + 1], Z[i - columns], Z[i + columns]
             k = (y0 + v) * int(view[4]) + x0 + u
-            if q <= background[k] or factor[k] == 0 or min(min(left, right), min(up, down)) <= 0:
+            if not takes_part(q, left, right, up, down, background[k], observed[k], factor[k], gate):
                 continue
-            bend = max(abs(left + right - 2 * q), abs(up + down - 2 * q))
-            offset = observed[k] - 1.0 / q
-            if bend > 0.01 * q or abs(offset) > gate:
-                continue
-            x, y = (x0 + u - view[2]) / view[0], (y0 + v - view[3]) / view[1]
-            nx, ny = 0.5 * (right - left) * view[0], 0.5 * (down - up) * view[1]
-            nz = q - x * nx - y * ny
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            nx, ny, nz = nx / length, ny / length, nz / length
-            residual = (nx * x + ny * y + nz) * offset
-            px, py, pz = x / q - middle[0], y / q - middle[1], 1.0 / q - middle[2]
-            jx, jy, jz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
-            weight = 1.0 / (1.0 + (residual / 0.004) ** 2)
+            jx, jy, jz, nx, ny, nz, residual, weight = point_to_plane(
+                q, left, right, up, down, x0 + u, y0 + v, observed[k], view, middle
+            )
             for j in range(row.shape[0]):
                 row[j] = (directions[0, j] * jx + directions[1, j] * jy + directions[2, j] * jz
                           + directions[3, j] * nx + directions[4, j] * ny + directions[5, j] * nz)  # fmt: skip
@@ -157,7 +147,32 @@ def _normal_equations(Z, x0, y0, columns, rows, view, background, observed, fact
 
 
 @numba.njit(**INLINED)
-def _solve(A, b):
+def takes_part(q, left, right, up, down, background, observed, factor, gate):
+    """Whether a pixel shows a smooth piece of the surface near its reading; q and its neighbours are inverse depths."""
+    if q <= background or factor == 0 or min(min(left, right), min(up, down)) <= 0:
+        return False
+    bend = max(abs(left + right - 2 * q), abs(up + down - 2 * q))
+    return not (bend > 0.01 * q or abs(observed - 1.0 / q) > gate)
+
+
+@numba.njit(**INLINED)
+def point_to_plane(q, left, right, up, down, u, v, observed, view, middle):
+    """Derivative of a pixel's distance from the rendered plane by a twist about ``middle`` (6 values), the distance and
+    its robust weight."""
+    offset = observed - 1.0 / q
+    x, y = (u - view[2]) / view[0], (v - view[3]) / view[1]
+    nx, ny = 0.5 * (right - left) * view[0], 0.5 * (down - up) * view[1]
+    nz = q - x * nx - y * ny
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx / length, ny / length, nz / length
+    residual = (nx * x + ny * y + nz) * offset
+    px, py, pz = x / q - middle[0], y / q - middle[1], 1.0 / q - middle[2]
+    jx, jy, jz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+    return jx, jy, jz, nx, ny, nz, residual, 1.0 / (1.0 + (residual / 0.004) ** 2)
+
+
+@numba.njit(**INLINED)
+def solve(A, b):
     """Solves A x = b in place by a damped Cholesky factorisation; A holds the lower triangle."""
     n = b.shape[0]
     for j in range(n):
@@ -182,7 +197,7 @@ def _solve(A, b):
 
 
 @numba.njit(**INLINED)
-def _move(pose, middle, twist):
+def move(pose, middle, twist):
     """Turns a pose by twist[:3] about ``middle`` and shifts it by twist[3:], in place."""
     angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2) + 1e-12
     x, y, z = twist[0] / angle, twist[1] / angle, twist[2] / angle

@@ -190,18 +190,19 @@ class ObjectLikelihood:
         self.shape = shape
         self.window = window
         self.form = form
-        self._plane = scene.plane
+        self.plane = scene.plane
+        """Unit normal and offset of the support plane."""
         self._evidence = evidence(
             window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(), window.credit.ravel(),
             window.view.numbers,
         )  # fmt: skip
         self.base = float(window.credit.sum(dtype=np.float64))
         """Cost of the window without the object."""
-        self._on_gpu = None if device == "cpu" else cuda_evaluator(shape, window, scene.plane, form)
+        self._on_gpu = None if device == "cpu" else cuda_evaluator(self)
 
     def costs(self, poses: Floats) -> Floats:
         """d(R, O) of equation 9 in metres times pixels for poses P x 3 x 4 (rows of T_camera_object)."""
-        change = self._on_gpu or self._on_cpu
+        change = self._on_cpu if self._on_gpu is None else self._on_gpu.changes
         return self.base + change(poses).astype(np.float64)
 
     def _on_cpu(self, poses: Floats) -> Float32s:
@@ -210,7 +211,7 @@ class ObjectLikelihood:
         limits = np.array([form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack], np.float32)
         change_of_cost(
             soup.lanes, soup.blocks, soup.corners, self.shape.support, np.ascontiguousarray(poses, np.float32),
-            window.view.numbers, self._evidence, self._plane, limits, out,
+            window.view.numbers, self._evidence, self.plane, limits, out,
         )  # fmt: skip
         return out
 
@@ -245,6 +246,8 @@ class ObjectLikelihood:
         ``directions`` are the D twists (rotation about the object's centre, translation; camera frame) in which the
         object may move, 6 x D. Readings farther than ``gate`` metres from the rendered surface take no part.
         """
+        if self._on_gpu is not None:
+            return self._on_gpu.refined(poses, directions, steps=steps, gate=gate)
         moved = np.array(poses, np.float64)
         soup, window = self.shape.soup, self.window
         gauss_newton(

@@ -7,18 +7,18 @@ number of threads, so that equal seeds give equal bytes in any process.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.contract import Refused
 from stages.perception.evaluators import Device
+from stages.perception.evolution import THINNED, Generation, Population, Step, evolved, resampled, steps
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window, credits
 from stages.perception.proposals import Dof, Guess, Proposals, distinct_best
-from stages.perception.rasteriser import KERNEL, Float32s
+from stages.perception.rasteriser import Float32s
 from stages.scene.catalogue import CatalogueObject, Floats
 
 Rectangle = tuple[int, int, int, int]
@@ -79,7 +79,7 @@ class FilterSettings:
     colour: bool = True
     """Colour decides between poses that depth cannot tell apart."""
     device: Device = "cpu"
-    """Where the filter's particles are weighed; polish runs on the CPU in either case."""
+    """Where particles are weighed, resampled, moved and polished."""
 
     def without(self, *improvements: str) -> FilterSettings:
         """These settings with improvements over the paper's plain form switched off, each by its name.
@@ -151,10 +151,29 @@ class _Phase:
 
     likelihood: ObjectLikelihood
     directions: Floats
-    start: float
-    """Progress of the annealing, 0 to 1, at the first and after the last iteration."""
-    end: float
-    iterations: int
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True)
+class Task:
+    """An object that is to be estimated from first guesses."""
+
+    filter: ObjectFilter
+    background: Float32s
+    """H x W inverse depth of the plane and the objects before."""
+    box: Rectangle
+    rng: np.random.Generator
+
+
+def run_together(scene: ObservedScene, tasks: Sequence[Task], *, iterations: int) -> list[Track]:
+    """Filters of one scene side by side, each with so many iterations; each ends as it would alone.
+
+    The filters have the same settings. On a GPU all their populations are one batch.
+    """
+    runs = [_Run(task, scene, iterations) for task in tasks]
+    for number in range(2):
+        _evolve(runs, number)
+    return [run.finish() for run in runs]
 
 
 class ObjectFilter:
@@ -170,13 +189,7 @@ class ObjectFilter:
         self, scene: ObservedScene, background: Float32s, box: Rectangle, *, iterations: int, rng: np.random.Generator
     ) -> Track:
         """Filters from first guesses; ``background`` is the inverse depth of the plane and the objects before."""
-        guess = self._guess(scene, background, box)
-        coarse, fine = self._phases(scene, background, box, guess, iterations)
-        population = _Population(self, guess, rng)
-        poses = population.begin(coarse)
-        for phase in (coarse, fine):
-            poses = population.evolve(poses, phase)
-        return population.finish(poses, coarse, fine)
+        return run_together(scene, [Task(self, background, box, rng)], iterations=iterations)[0]
 
     def revisit(
         self, scene: ObservedScene, background: Float32s, box: Rectangle, track: Track, *, rng: np.random.Generator
@@ -185,16 +198,15 @@ class ObjectFilter:
 
         Returns the track itself where nothing is clearly better.
         """
-        guess = self._guess(scene, background, box)
-        coarse, fine = self._phases(scene, background, box, guess, 1)
-        population = _Population(self, guess, rng)
-        found = population.finish(population.around(track.T_camera_object, coarse), coarse, fine)
-        before = float(fine.likelihood.energies(track.T_camera_object[None])[0])
-        if found.cost > before - _GAIN * abs(fine.likelihood.base):
+        run = _Run(Task(self, background, box, rng), scene, 1)
+        run.around(track.T_camera_object)
+        found, fine = run.finish(), run.phases[1].likelihood
+        before = float(fine.energies(track.T_camera_object[None])[0])
+        if found.cost > before - _GAIN * abs(fine.base):
             return track
         return replace(track, T_camera_object=found.T_camera_object, cost=found.cost)
 
-    def _guess(self, scene: ObservedScene, background: Float32s, box: Rectangle) -> Guess:
+    def guess(self, scene: ObservedScene, background: Float32s, box: Rectangle) -> Guess:
         """Readings in the box that the background leaves unexplained, or failing those any foreground, any reading,
         the plane itself."""
         part = np.s_[box[1] : box[3], box[0] : box[2]]
@@ -207,9 +219,10 @@ class ObjectFilter:
         inverse = np.maximum(scene.plane_inverse[part], 1e-1)
         return Guess((rays / inverse[..., None]).reshape(-1, 3), scene.T_camera_table)
 
-    def _phases(
+    def phases(
         self, scene: ObservedScene, background: Float32s, box: Rectangle, guess: Guess, iterations: int
     ) -> tuple[_Phase, _Phase]:
+        """The coarse half of the schedule and the fine one."""
         settings = self.settings
         count = min(iterations, settings.schedule or iterations)
         apparent = self.fine.diameter / float(np.median(guess.points[:, 2])) * scene.view.fx
@@ -226,72 +239,82 @@ class ObjectFilter:
         first = likelihood(rough, settings.coarse_pixels or settings.fine_pixels, settings.cost)
         second = likelihood(self.fine, settings.fine_pixels, sharp)
         half = count // 2
-        return _Phase(first, directions, 0.0, 0.5, count - half), _Phase(second, directions, 0.5, 1.0, half)
+        return (
+            _Phase(first, directions, steps(settings, 0.0, 0.5, count - half)),
+            _Phase(second, directions, steps(settings, 0.5, 1.0, half)),
+        )
 
 
-class _Population:
-    """The particles of one object as they evolve."""
+class _Run:
+    """The particles of one object from first guesses, or from a known pose, to the best one."""
 
-    def __init__(self, owner: ObjectFilter, guess: Guess, rng: np.random.Generator) -> None:
-        self._settings = owner.settings
-        self._proposals = owner.proposals
-        self._guess = guess
-        self._rng = rng
+    def __init__(self, task: Task, scene: ObservedScene, iterations: int) -> None:
+        owner, self._rng = task.filter, task.rng
+        self._settings, self._proposals = owner.settings, owner.proposals
+        self._guess = owner.guess(scene, task.background, task.box)
+        self.phases = owner.phases(scene, task.background, task.box, self._guess, iterations)
+        self._poses = np.zeros((0, 3, 4))
         self._iteration = 0
-        self._kept: list[tuple[int, float, Floats]] = []
+        self._kept: list[tuple[int, Generation]] = []
 
-    def begin(self, phase: _Phase) -> Floats:
+    @property
+    def settings(self) -> FilterSettings:
+        """Those of the object's filter."""
+        return self._settings
+
+    def begin(self) -> None:
         """First generation: the better ones of many guesses, or the paper's uniform ones."""
         settings = self._settings
         if not settings.overdraw:
-            return self._proposals.uniform(self._guess, settings.particles, self._rng)
+            self._poses = self._proposals.uniform(self._guess, settings.particles, self._rng)
+            return
         poses = self._proposals.initial(self._guess, settings.overdraw * settings.particles, self._rng)
-        costs = phase.likelihood.energies(poses)
-        chosen = self._resampled(costs, settings.particles)
-        return self._polished(poses[chosen], phase, int(2 * settings.polished * settings.particles), gate=0.04)
+        costs = self.phases[0].likelihood.energies(poses)
+        self._poses = poses[resampled(costs, settings, settings.particles, self._rng)]
+        few = int(2 * settings.polished * settings.particles)
+        if few:
+            phase = self.phases[0]
+            self._poses[:few] = phase.likelihood.refine(self._poses[:few], phase.directions, steps=2, gate=0.04)
 
-    def evolve(self, poses: Floats, phase: _Phase) -> Floats:
-        """Weights, resamples and diffuses until the phase ends; returns the last generation, the best one first."""
-        best, stale = np.inf, 0
-        for i in range(phase.iterations):
-            costs = phase.likelihood.energies(poses)
-            champion = int(np.argmin(costs))
-            self._keep(poses, float(costs[champion]))
-            improved = costs[champion] < 0.995 * best
-            best, stale = min(best, float(costs[champion])), 0 if improved else stale + 1
-            explains = best < phase.likelihood.base
-            settled = explains and stale >= self._settings.patience and self._settings.schedule is not None
-            progress = phase.start + (phase.end - phase.start) * (i / phase.iterations)
-            poses = self._next(poses, costs, poses[champion], phase, progress)
-            if settled:
-                break
-        return poses
+    def population(self, number: int) -> Population:
+        """The present generation, ready for a phase."""
+        phase = self.phases[number]
+        return Population(self._poses, phase.likelihood, phase.directions, self._proposals, self._guess, self._rng)
 
-    def around(self, pose: Floats, phase: _Phase) -> Floats:
+    def went(self, poses: Floats, history: Sequence[Generation]) -> None:
+        """Takes over what came out of a phase."""
+        self._poses = poses
+        for generation in history:
+            self._keep(generation)
+
+    def around(self, pose: Floats) -> None:
         """A small generation about a known pose: the best of its surroundings and of new guesses, polished too."""
+        phase = self.phases[0]
         near = np.repeat(pose[None], self._settings.particles // 8, 0)
         near = self._proposals.diffuse(near, phase.directions, metres=0.008, radians=np.deg2rad(15.0), rng=self._rng)
         fresh = self._proposals.initial(self._guess, _FRESH * self._settings.particles, self._rng)
         poses = np.concatenate([pose[None], near, fresh])
         cheap = distinct_best(poses, phase.likelihood.energies(poses), 40, metres=0.006, radians=np.deg2rad(10.0))
-        nearby = np.concatenate([pose[None], poses[cheap]])
-        if not self._settings.polished:
-            return nearby
-        return np.concatenate([nearby, phase.likelihood.refine(poses[cheap], phase.directions, steps=4, gate=0.03)])
-
-    def finish(self, poses: Floats, coarse: _Phase, phase: _Phase) -> Track:
-        """The particle of least cost (equation 10), after polish where that lowers its cost further."""
-        costs = phase.likelihood.energies(poses)
+        self._poses = np.concatenate([pose[None], poses[cheap]])
         if self._settings.polished:
-            poses = self._leaders(poses, costs, coarse, phase)
-            costs = phase.likelihood.energies(poses)
+            polished = phase.likelihood.refine(poses[cheap], phase.directions, steps=4, gate=0.03)
+            self._poses = np.concatenate([self._poses, polished])
+
+    def finish(self) -> Track:
+        """The particle of least cost (equation 10), after polish where that lowers its cost further."""
+        poses, likelihood = self._poses, self.phases[1].likelihood
+        costs = likelihood.energies(poses)
+        if self._settings.polished:
+            poses = self._leaders(poses, costs)
+            costs = likelihood.energies(poses)
         champion = int(np.argmin(costs))
-        self._keep(poses, float(costs[champion]))
+        self._keep(Generation(float(costs[champion]), poses[::THINNED, :, 3].copy()))
         return self._track(poses[champion], float(costs[champion]))
 
-    def _leaders(self, poses: Floats, costs: Floats, coarse: _Phase, fine: _Phase) -> Floats:
+    def _leaders(self, poses: Floats, costs: Floats) -> Floats:
         """The best of the distinct poses and of all flips of the first, before and after polish; polish sorts them out
         where pixels are few, and takes the few that remain to the end."""
+        coarse, fine = self.phases
         best = poses[distinct_best(poses, costs, 12, metres=0.01, radians=np.deg2rad(10.0))]
         flips = self._proposals.all_flips(best[0], self._guess.T_camera_table)[1:]
         rough = coarse.likelihood.refine(np.concatenate([best, flips]), coarse.directions, steps=5, gate=0.03)
@@ -300,75 +323,27 @@ class _Population:
         few = leaders[distinct_best(leaders, costs, _LEADERS, metres=0.003, radians=np.deg2rad(4.0))]
         return np.concatenate([few, fine.likelihood.refine(few, fine.directions, steps=6, gate=0.03)])
 
-    def _next(self, poses: Floats, costs: Floats, champion: Floats, phase: _Phase, progress: float) -> Floats:
-        """Resampling and transition: equation 5, then the improvements that are switched on."""
-        settings, rng, count = self._settings, self._rng, self._settings.count(progress)
-        metres = settings.metres[0] ** (1 - progress) * settings.metres[1] ** progress
-        radians = settings.radians[0] ** (1 - progress) * settings.radians[1] ** progress
-        chosen = poses[self._resampled(costs, count)]
-        following = self._proposals.diffuse(chosen, phase.directions, metres=metres, radians=radians, rng=rng)
-        following = following[rng.permutation(count)]
-        flipped, renewed = int(settings.flips * count), int(settings.renewed * (1 - progress) * count)
-        if flipped:
-            following[:flipped] = self._proposals.flipped(following[:flipped], self._guess.T_camera_table, rng)
-        if renewed:
-            following[-renewed:] = self._proposals.initial(self._guess, renewed, rng)
-        following = self._polished(following, phase, flipped + int(settings.polished * count), gate=0.03)
-        if settings.elitism:
-            following[-1] = champion
-        return following
-
-    def _polished(self, poses: Floats, phase: _Phase, count: int, *, gate: float) -> Floats:
-        if self._settings.polished and count:
-            poses[:count] = phase.likelihood.refine(poses[:count], phase.directions, steps=2, gate=gate)
-        return poses
-
-    def _resampled(self, costs: Floats, count: int) -> NDArray[np.intp]:
-        """Systematic resampling by the weights of equations 7 and 8."""
-        weights = _weights(costs, self._settings, count)
-        positions = (self._rng.random() + np.arange(count)) / count
-        return np.minimum(np.searchsorted(np.cumsum(weights), positions), len(costs) - 1)
-
-    def _keep(self, poses: Floats, cost: float) -> None:
+    def _keep(self, generation: Generation) -> None:
         if self._iteration % 4 == 0:
-            self._kept.append((self._iteration, cost, poses[::25, :, 3].copy()))
+            self._kept.append((self._iteration, generation))
         self._iteration += 1
 
     def _track(self, pose: Floats, cost: float) -> Track:
-        rows = [np.column_stack([np.full(len(p), float(i)), p]) for i, _, p in self._kept]
-        iterations, costs, _ = zip(*self._kept, strict=True) if self._kept else ((), (), ())
+        rows = [np.column_stack([np.full(len(g.positions), float(i)), g.positions]) for i, g in self._kept]
+        costs = tuple(generation.cost for _, generation in self._kept)
         positions = np.concatenate(rows) if rows else np.zeros((0, 4))
-        return Track(pose, cost, tuple(iterations), tuple(costs), positions)
+        return Track(pose, cost, tuple(i for i, _ in self._kept), costs, positions)
 
 
-def _weights(costs: Floats, settings: FilterSettings, count: int) -> Floats:
-    """Normalised weights exp(-lambda_r d); the scale is found by bisection where none is given."""
-    excess = costs - costs.min()
-    if settings.lambda_r is not None:
-        return _normalised(np.exp(-settings.lambda_r * excess))
-    return _normalised(np.exp(-_scale(excess, settings.effective * count) * excess))
-
-
-@numba.njit(**KERNEL)
-def _scale(excess, effective):  # pyright: ignore[reportMissingParameterType]
-    """The scale at which as many of the weights exp(-scale excess) count: bisection of its logarithm."""
-    low, high = -12.0, 12.0
-    for _ in range(24):
-        middle = (low + high) / 2
-        scale, total, squares = np.exp(middle), 0.0, 0.0
-        for i in range(excess.shape[0]):
-            weight = np.exp(-scale * excess[i])
-            total += weight
-            squares += weight * weight
-        if total * total > effective * squares:
-            low = middle
-        else:
-            high = middle
-    return np.exp(low)
-
-
-def _normalised(weights: Floats) -> Floats:
-    return weights / weights.sum()
+def _evolve(runs: Sequence[_Run], number: int) -> None:
+    """Takes all runs through a phase of the schedule, which they share."""
+    if number == 0:
+        for run in runs:
+            run.begin()
+    plan, settings = runs[0].phases[number].steps, runs[0].settings
+    evolution = evolved([run.population(number) for run in runs], plan, settings)
+    for run, poses, history in zip(runs, evolution.population(), evolution.history(), strict=True):
+        run.went(poses, history)
 
 
 def _expanded(box: Rectangle, margin: float, scene: ObservedScene) -> Rectangle:

@@ -23,6 +23,7 @@ from stages.scene.catalogue import CatalogueObject, Floats
 
 Dof = Literal[3, 6]
 _SAME = np.deg2rad(12.0)
+_YAWS = np.asarray(np.arange(1, 12) * (np.pi / 6), float)
 _FACES = 24
 _ROUGHLY = 0.1
 """Normals that differ by less belong to one face."""
@@ -51,8 +52,11 @@ class Proposals:
         # The catalogue's z axis is up when an object stands; resting poses of scanned meshes may lean a little.
         self._resting = np.eye(3)[None] if dof == 3 else np.stack([np.eye(3), *item.resting])
         self._symmetries = item.symmetries.transforms()
-        self._axes = box_axes(self._vertices)
-        turns = compose(compose(self._axes, cube_rotations()), self._axes.T)
+        self.axes = box_axes(self._vertices)
+        """The object's own axes, as columns in its frame, 3 x 3."""
+        self.spins = dof == 6
+        """Whether every second flip is a turn by any angle about one of the axes."""
+        turns = compose(compose(self.axes, cube_rotations()), self.axes.T)
         self._flips = self._distinct(np.concatenate([turns, item.symmetries.near[:, :3, :3]]))
 
     def initial(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
@@ -96,11 +100,16 @@ class Proposals:
         every second one is a turn by any angle about one of the object's axes."""
         flips = self._flip_turns(poses, T_camera_table)
         chosen = flips[np.arange(len(poses)), rng.integers(flips.shape[1], size=len(poses))]
-        if self.dof == 6:
-            axes = rotate(poses[:, :, :3], self._axes.T[rng.integers(3, size=len(poses))])
+        if self.spins:
+            axes = rotate(poses[:, :, :3], self.axes.T[rng.integers(3, size=len(poses))])
             turns = exp_so3(axes * rng.uniform(-np.pi, np.pi, (len(poses), 1)))
             chosen = np.where((np.arange(len(poses)) % 2 == 0)[:, None, None], chosen, turns)
         return self._turned(poses, chosen, np.zeros(3))
+
+    @property
+    def flips(self) -> Floats:
+        """Rotations in the object's frame that flip it, F x 3 x 3: those of its shape, or turns about the upright."""
+        return exp_so3(_YAWS[:, None] * np.array([0.0, 0.0, 1.0])) if self.dof == 3 else self._flips
 
     def all_flips(self, pose: Floats, T_camera_table: Floats) -> Floats:
         """Every flip of one pose, itself first, F x 3 x 4."""
@@ -111,8 +120,7 @@ class Proposals:
     def _flip_turns(self, poses: Floats, T_camera_table: Floats) -> Floats:
         """Rotations in the camera frame that flip each pose, P x F x 3 x 3."""
         if self.dof == 3:
-            yaws = np.arange(1, 12) * (np.pi / 6)
-            turns = exp_so3(yaws[:, None] * T_camera_table[:3, 2])
+            turns = exp_so3(_YAWS[:, None] * T_camera_table[:3, 2])
             return np.broadcast_to(turns, (len(poses), *turns.shape))
         R = poses[:, None, :, :3]
         return compose(compose(R, self._flips[None]), np.swapaxes(R, -1, -2))

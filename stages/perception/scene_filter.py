@@ -12,7 +12,7 @@ import numpy as np
 from stages.messages.digest import Glimpse
 from stages.perception.composition import Composition, fit, glimpse, scene_cost
 from stages.perception.likelihood import ObservedScene, with_object
-from stages.perception.particle_filter import FilterSettings, ObjectFilter, Track, pixels
+from stages.perception.particle_filter import FilterSettings, ObjectFilter, Task, Track, pixels, run_together
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, Floats
 
@@ -99,9 +99,19 @@ class SceneFilter:
 
     def look(self, scene: ObservedScene, suspect: Suspect, *, among: int) -> Track:
         """One candidate alone on the plane; the budget of iterations is divided ``among`` so many."""
+        return self.looks(scene, [suspect], among=among)[0]
+
+    def looks(self, scene: ObservedScene, suspects: Sequence[Suspect], *, among: int) -> list[Track]:
+        """Looks at several candidates, each alone; on a GPU those that are new are one batch."""
         share = self._settings.iterations // max(1, among)
-        key = _extended(_extended_by(self._observation_key(scene, share), b"alone"), suspect)
-        return self._remembered(key, scene, scene.plane_inverse, suspect, share)
+        alone = _extended_by(self._observation_key(scene, share), b"alone")
+        keys = [_extended(alone, suspect) for suspect in suspects]
+        new = {key: suspect for key, suspect in zip(keys, suspects, strict=True) if key not in self._tracks}
+        tracks = {key: self._tracks[key] for key in keys if key in self._tracks}
+        tracks |= self._run_together(scene, new, share)
+        for key in new:
+            self._remember(key, tracks[key])
+        return [tracks[key] for key in keys]
 
     def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Glimpse:
         """What a track would show, for the first ranking of combinations."""
@@ -120,7 +130,7 @@ class SceneFilter:
             tracks = self._sequence(scene, suspects)
             layers = self._layers(scene, suspects, tracks)
             return self._result(scene, tracks, layers, scene_cost(scene, layers, self._settings.cost))
-        begun = list(starts or [self.look(scene, suspect, among=len(suspects)) for suspect in suspects])
+        begun = list(starts or self.looks(scene, suspects, among=len(suspects)))
         draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), self._composition(scene, suspects))
         if (bound := draft.composition.bound()) > reached:
             return self._result(scene, begun, draft.layers, bound, dropped=True)
@@ -157,15 +167,28 @@ class SceneFilter:
         track = self._tracks.get(key)
         if track is None:
             track = self._run(scene, background, suspect, iterations, key)
-            self._tracks[key] = track
-            if len(self._tracks) > self._memory:
-                self._tracks.popitem(last=False)
+            self._remember(key, track)
         return track
+
+    def _remember(self, key: bytes, track: Track) -> None:
+        self._tracks[key] = track
+        if len(self._tracks) > self._memory:
+            self._tracks.popitem(last=False)
 
     def _run(self, scene: ObservedScene, background: Float32s, suspect: Suspect, iterations: int, key: bytes) -> Track:
         self.runs += 1
-        box = pixels(suspect.box, scene)
-        return self._filter(suspect.label).run(scene, background, box, iterations=iterations, rng=_generator(key))
+        return run_together(scene, [self._task(scene, background, suspect, key)], iterations=iterations)[0]
+
+    def _run_together(
+        self, scene: ObservedScene, suspects: dict[bytes, Suspect], iterations: int
+    ) -> dict[bytes, Track]:
+        """Each suspect alone on the plane, seeded by its key."""
+        self.runs += len(suspects)
+        tasks = [self._task(scene, scene.plane_inverse, suspect, key) for key, suspect in suspects.items()]
+        return dict(zip(suspects, run_together(scene, tasks, iterations=iterations), strict=True)) if tasks else {}
+
+    def _task(self, scene: ObservedScene, background: Float32s, suspect: Suspect, key: bytes) -> Task:
+        return Task(self._filter(suspect.label), background, pixels(suspect.box, scene), _generator(key))
 
     def _settle(self, draft: _Draft, reached: float) -> None:
         """Visits objects again, the others known, until nothing changes.

@@ -13,15 +13,19 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numba.cuda.dispatcher
-from numba import cuda, float32, int32, int64, void
+from numba import cuda, float32, float64, int32, int64, void
 
-from stages.perception import cuda_evolution, cuda_kernels
+from stages.perception import cuda_evolution, cuda_kernels, cuda_refine
 
 f1, f2, f3, f4 = float32[::1], float32[:, ::1], float32[:, :, ::1], float32[:, :, :, ::1]
-i1, i2 = int32[::1], int32[:, ::1]
+i1, i2, seeds = int32[::1], int32[:, ::1], int64[::1]
 SIGNATURES = {
     "evaluate": (cuda_kernels.evaluate, void(f1, i2, f3, f2, f2, i1, f2, f2, f2, f3, i1, i1, f1)),
-    "evolve": (cuda_evolution.evolve, void(f1, f3, f3, i2, f2, f2, f2, f3, f3, f4, f2, f1, int64, i1, f2)),
+    "evolve": (
+        cuda_evolution.evolve,
+        void(f1, f3, f3, i1, i2, f2, f3, f2, f3, f3, f4, f2, i2, f1, seeds, i2, i1, f2, f4),
+    ),
+    "refine": (cuda_refine.refine, void(f1, i2, f3, f2, f2, i1, f2, f3, f3, i1, i1, i1, int32, float64)),
 }
 MISSING = 3
 """Exit status where the toolkit is not at hand."""

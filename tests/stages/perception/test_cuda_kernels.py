@@ -32,8 +32,10 @@ def test_kernels_compile_for_a_hopper_card(tmp_path: Path) -> None:
     if done.returncode == NO_TOOLKIT:
         pytest.skip(done.stdout.strip())
     assert done.returncode == 0, done.stdout + done.stderr
-    cost, evolution = done.stdout.splitlines()
+    cost, evolution, polish = done.stdout.splitlines()
     assert " 0 bytes spilt, 0 instructions in double precision" in cost
     # Its doubles are in the sine of arguments beyond 10^5, which never occur.
     assert evolution.startswith("evolve: ")
     assert " 0 bytes spilt, " in evolution
+    # Few particles are polished, and in double precision as on the CPU.
+    assert polish.startswith("refine: ")
