@@ -12,13 +12,13 @@ import traceback
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from runner import codec
 from runner.bus import RECORDER, Bus, Packet, Presence, Process
-from runner.children import die_with_parent
+from runner.children import die_with_parent, explain_death, volunteer_for_oom
 from runner.codec import CodecError, Envelope, LogLine, Outcome, Receipt, Step
 from runner.contract import Level, Refused
 from runner.delivery import Delivery, Stopped
@@ -26,10 +26,11 @@ from runner.graph import Route, node_from_entry
 from runner.health import Heart
 from runner.inbox import Inbox, Mismatched, Ready
 from runner.network import Network
+from runner.past import past_of, relive
 from runner.ports import Handler
+from runner.recording import Recording
+from runner.refusals import Refusals, admit, require_genuine
 from runner.step import Executor, receive, step_time
-
-R = TypeVar("R", Envelope, Step, Receipt)
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
@@ -56,6 +57,10 @@ class Assignment(msgspec.Struct, frozen=True):
     incarnation: int = 0
     network: Network | None = None
     """None on loopback."""
+    secret: str = ""
+    """Of the run's bus."""
+    past: str = ""
+    """Recording from which a stateful stage gets back what its earlier processes knew; empty for others."""
     numbers: dict[str, int] = {}
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
@@ -72,7 +77,13 @@ class Host:
         self._task = assignment
         self._node = node_from_entry(assignment.stage, assignment.entry)
         self._stage = self._node.construct()
-        self._bus = Bus(assignment.run, connect=assignment.endpoint, network=assignment.network)
+        if assignment.past:
+            recording = Recording(Path(assignment.past))
+            steps = past_of(recording, assignment.stage, assignment.incarnation)
+            relive(self._node, self._stage, assignment.seed, recording, steps)
+        self._bus = Bus(
+            assignment.run, connect=assignment.endpoint, network=assignment.network, secret=assignment.secret
+        )
         self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
         self._presence = Presence()
         self._stopping = threading.Event()
@@ -92,7 +103,7 @@ class Host:
         self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
         """(port, id) of what has arrived, and whether it is consumed."""
         self._remember(assignment.consumed)
-        self._refused = 0
+        self._refusals = Refusals(lambda text: self._log(text, "error"))
         self._steps = 0
         self._received = dict.fromkeys(self._node.inputs, 0)
         """Messages by port; the bus' thread counts these, the main thread those that it has decoded."""
@@ -157,7 +168,7 @@ class Host:
             "handler": "" if record is None else record.handler,
             "busy_ns": 0 if record is None else record.busy_ns,
             "steps": self._steps,
-            "refused": self._refused,
+            "refused": self._refusals.count,
             "queued": {port: self._received[port] - self._decoded[port] + waiting for port, waiting in queued.items()},
             "skipped": dict(self._inbox.skipped),
             "unanswered": self._delivery.unanswered(),
@@ -174,12 +185,12 @@ class Host:
 
     def _on_step(self, packet: Packet) -> None:
         """A step that was done acknowledges what it consumed; one that failed will be tried again."""
-        step = self._read(Step, packet)
+        step = self._refusals.read(Step, packet)
         if step is not None and step.outcome == "done":
             self._delivery.acknowledge(step.stage, step.consumed)
 
     def _on_receipt(self, packet: Packet) -> None:
-        receipt, consumer = self._read(Receipt, packet), packet.key.rpartition("/")[2]
+        receipt, consumer = self._refusals.read(Receipt, packet), packet.key.rpartition("/")[2]
         if receipt is not None and receipt.consumed:
             self._delivery.acknowledge(consumer, [(receipt.port, receipt.id)])
         elif receipt is not None:
@@ -191,7 +202,7 @@ class Host:
         if port in self._received:
             self._received[port] += 1
         with contextlib.suppress(CodecError):  # what is malformed is refused by who takes it
-            id = codec.unpack(Envelope, packet.payload).id
+            id = admit(Envelope, packet).id
             self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
         self._deliveries.put(packet)
 
@@ -200,18 +211,6 @@ class Host:
         while self._receipts:
             self._bus.publish(f"r/{self._process.stage}", codec.pack(self._receipts.popleft()))
 
-    def _read(self, kind: type[R], packet: Packet) -> R | None:
-        try:
-            return codec.unpack(kind, packet.payload)
-        except CodecError as error:
-            self._refuse(packet, error)
-            return None
-
-    def _refuse(self, packet: Packet, error: Exception) -> None:
-        """Counts and shows what cannot be taken; the process lives on."""
-        self._refused += 1
-        self._log(f"{packet.key}: message refused ({self._refused} so far): {error}", "error")
-
     def _take(self, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
         name = _port_of(packet)
@@ -219,16 +218,18 @@ class Host:
             self._decoded[name] += 1
         try:
             envelope = codec.unpack(Envelope, packet.payload)
-            if (name, envelope.id) in self._arrived:
+            if packet.genuine and (name, envelope.id) in self._arrived:
                 return
             port = self._node.type.inputs.get(name)
             if port is None:
                 raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
             travelled = packet.arrived_ns - packet.sent_ns if packet.sent_ns else 0
-            self._inbox.add(receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled))
+            arrival = receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled)
+            require_genuine(packet)
+            self._inbox.add(arrival)
             self._arrived[name, envelope.id] = False
         except (CodecError, Mismatched) as error:
-            self._refuse(packet, error)
+            self._refusals.refuse(packet.key, error)
 
     # ------------------------------------------------------------------------------------------ steps
 
@@ -416,9 +417,12 @@ def _summary(error: Exception) -> str:
 
 def main() -> int:
     """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
+    explain_death()
     die_with_parent()
+    volunteer_for_oom()
     sys.setswitchinterval(SWITCH_SECONDS)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for signum in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(signum, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
     try:

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import os
 import queue
+import secrets
 import signal
 import subprocess
 import threading
@@ -18,17 +19,20 @@ import msgspec
 from runner import codec
 from runner.bus import RECORDER, Bus, Packet, Presence, Process, free_endpoint
 from runner.calls import CallQuestion, CallRequest, Calls
-from runner.children import ending, last_lines, signal_group, spawn
-from runner.codec import CodecError, Envelope, LogLine, Receipt, Step
+from runner.children import DUMP, ending, last_lines, signal_group, spawn
+from runner.codec import CodecError, Envelope, LogLine, Pulse, Receipt, Step
 from runner.contract import Finished, Level, Message, Refused, Restarted
 from runner.delivery import Delivery
 from runner.document import suggest
-from runner.graph import FINISHED, SUPERVISOR, Graph, graph_to_json, node_entry
-from runner.health import Pulses
+from runner.graph import FINISHED, SUPERVISOR, Graph, Limits, graph_to_json, node_entry
+from runner.health import Pulses, Watch, gigabytes, oom_kills
 from runner.host import EXIT_REFUSED, Assignment
+from runner.hosts import Hosts, RemoteChild
 from runner.info import stage_times
+from runner.network import ALONE
 from runner.ports import port_name
 from runner.recorder import Manifest, topic
+from runner.refusals import Refusals, admit, require_genuine
 from runner.registry import Entry, Registration, runs
 from runner.status import ProcessStatus, Rates, RunStatus, topics_of
 from runner.step import sequence_of
@@ -38,12 +42,14 @@ STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
 RECORDER_GRACE_SECONDS = 2.5
 TICK_SECONDS = 0.05
-SETTLE_SECONDS = 5.0
+DUMP_SECONDS = 0.5
+"""What a hung process gets to print where it hangs before it is killed."""
+SETTLE_SECONDS = 30.0
 """How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
 RETIRE_SECONDS = 30.0
 """What a process that is asked to restart may take for its present step; a killed step is done again."""
 ASKED = "asked to restart"
-SHOWN_LINES = 8
+SHOWN_LINES = 12
 EXIT_INCOMPLETE = 3
 
 
@@ -58,7 +64,7 @@ class End:
 @dataclass(slots=True)
 class _Child:
     process: Process
-    handle: subprocess.Popen[bytes]
+    handle: subprocess.Popen[bytes] | RemoteChild
     log: Path
     started: float = field(default_factory=time.monotonic)
     announced: bool = False
@@ -70,12 +76,26 @@ class _Child:
     """Why its predecessor ended."""
     retires_by: float | None = None
     """When it is killed if it has not gone by itself; None where it was not asked to."""
+    watch: Watch = field(default_factory=lambda: Watch(Limits()))
+    oom_kills: int = field(default_factory=oom_kills)
+    """By the kernel, before it was started."""
+    condemned: str = ""
+    """Why the supervisor kills it."""
+    dies_at: float = float("inf")
+    heir: tuple[str, int] | None = None
+    """Once it is dead: why it is replaced, and how often it has crashed by now."""
 
-    def reason(self) -> str:
-        """Why it ended: the signal, or the last thing it printed."""
+    def reason(self, newest: Pulse | None = None) -> str:
+        """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
+        if self.condemned:
+            return self.condemned
         code = self.handle.returncode
         lines = last_lines(self.log, 1)
-        return lines[0] if lines and code is not None and code >= 0 else ending(code or 0)
+        if lines and code is not None and code >= 0:
+            return lines[0]
+        held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
+        out_of_memory = code == -signal.SIGKILL and oom_kills() > self.oom_kills
+        return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
 
 
 @dataclass(slots=True)
@@ -102,15 +122,19 @@ class Supervisor:
     def __init__(self, graph: Graph, *, file: Path, recordings: Path, settings: tuple[str, ...], terminal: Terminal):
         """Makes the folder of the run and lists it; raises Refused where that is not possible.
 
-        ``file`` is where the graph was read from.
+        ``file`` is where the graph was read from. Where it names hosts, this machine is the head.
         """
         self._graph = graph
         self._settings = settings
         self._terminal = terminal
         self._run, self.recording = _new_recording(recordings, graph.name)
         self.directory = self.recording.with_suffix("")
-        self._endpoint = free_endpoint()
-        self._bus = Bus(self._run, listen=self._endpoint)
+        self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
+        self._network = self._hosts.network if self._hosts else None
+        self._endpoint = self._hosts.endpoint if self._hosts else free_endpoint()
+        listen, connect = (None, self._endpoint) if self._hosts else (self._endpoint, None)
+        self._secret = secrets.token_hex(16)
+        self._bus = Bus(self._run, listen=listen, connect=connect, network=self._network, secret=self._secret)
         self._entry = Entry(
             run=self._run,
             endpoint=self._endpoint,
@@ -118,6 +142,7 @@ class Supervisor:
             graph=str(file.absolute()),
             recording=str(self.recording.absolute()),
             started=time.time(),
+            network=self._network,
         )
         self._registration = Registration(self._entry)
         self._stopping = threading.Event()
@@ -130,6 +155,7 @@ class Supervisor:
         self._viewer: _Child | None = None
         self._presence = Presence()
         self._pulses = Pulses()
+        self._refusals = Refusals(self._complain)
         self._rates = Rates()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
@@ -149,12 +175,14 @@ class Supervisor:
             self._recorder = self._start_recorder()
             if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
                 self._viewer = self._start_viewer()
+            if self._hosts is not None:
+                self._hosts.open(self._run)
             for stage, replica in self._graph.processes():
                 self._children[stage, replica] = self._start(Process(stage, replica))
             end = self._watch()
         finally:
             verdict = self._stop()
-        return self._conclude(end, verdict)
+        return self._dismiss(self._conclude(end, verdict))
 
     # ------------------------------------------------------------------------------------------ what is heard
 
@@ -164,16 +192,16 @@ class Supervisor:
         self._bus.subscribe("j/*", self._on_step)
         self._bus.subscribe("l/*", self._on_log)
         self._bus.subscribe(f"m/*/{FINISHED}", self._on_finished)
-        self._bus.subscribe("gone/*/*/*", self._on_gone)
-        self._bus.subscribe("h/*/*", self._on_pulse)
+        self._bus.subscribe("gone/**", self._on_gone)
+        self._bus.subscribe("h/**", self._on_pulse)
         for key in self._calls.answer_keys:
             self._bus.subscribe(f"m/{key}", self._on_answer)
         self._serve()
-        self._bus.watch(self._on_presence)
+        self._bus.watch(self._on_presence, self._refusals.refuse)
 
     def _on_step(self, packet: Packet) -> None:
-        with contextlib.suppress(CodecError):
-            step = codec.unpack(Step, packet.payload)
+        step = self._refusals.read(Step, packet)
+        if step is not None:
             self._progress[step.stage].note(step)
             self._steps.append(step)
             if step.outcome == "done":
@@ -181,42 +209,50 @@ class Supervisor:
                 self._calls.note_step(step)
 
     def _on_answer(self, packet: Packet) -> None:
-        with contextlib.suppress(CodecError):
-            self._calls.note_answer(codec.unpack(Envelope, packet.payload).id, packet.payload)
+        envelope = self._refusals.read(Envelope, packet)
+        if envelope is not None:
+            self._calls.note_answer(envelope.id, packet.payload)
 
     def _on_receipt(self, packet: Packet) -> None:
-        with contextlib.suppress(CodecError):
-            receipt = codec.unpack(Receipt, packet.payload)
-            if receipt.consumed:
-                self._delivery.acknowledge(packet.key.rpartition("/")[2], [(receipt.port, receipt.id)])
+        receipt = self._refusals.read(Receipt, packet)
+        if receipt is not None and receipt.consumed:
+            self._delivery.acknowledge(packet.key.rpartition("/")[2], [(receipt.port, receipt.id)])
 
     def _on_log(self, packet: Packet) -> None:
-        with contextlib.suppress(CodecError):
-            line = codec.unpack(LogLine, packet.payload)
+        line = self._refusals.read(LogLine, packet)
+        if line is not None:
             self._calls.note_log(line)
             if line.stage != SUPERVISOR and line.level != "debug":
                 self._terminal.show(self._name_of(line.stage, line.replica), line.text, line.level)
 
     def _on_finished(self, packet: Packet) -> None:
         try:
-            finished = codec.open_envelope(Finished, codec.unpack(Envelope, packet.payload))
+            finished = codec.open_envelope(Finished, admit(Envelope, packet))
         except CodecError as error:
-            self._say(f"{packet.key}: message refused: {error}", "error")
+            self._refusals.refuse(packet.key, error)
         else:
             self._events.put(End(finished.code, finished.reason))
 
     def _on_gone(self, packet: Packet) -> None:
-        self._settled.add(Process.of(packet.key))
+        try:
+            require_genuine(packet)
+            self._settled.add(Process.of(packet.key))
+        except (CodecError, Refused) as error:
+            self._refusals.refuse(packet.key, error)
 
     def _on_pulse(self, packet: Packet) -> None:
-        with contextlib.suppress(CodecError):
-            self._rates.note(self._pulses.note(packet.payload), packet.arrived_ns)
+        pulse = self._refusals.read(Pulse, packet)
+        if pulse is not None:
+            self._pulses.note(pulse)
+            self._rates.note(pulse, packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         self._delivery.update(process, present)
         self._presence.update(process, present)
+        if present and self._recorder is not None and process == self._recorder.process:
+            self._recorder.announced = True
         child = self._children.get((process.stage, process.replica))
-        if not present or child is None:
+        if not present or child is None or child.process != process:
             return
         child.ready_after = time.monotonic() - child.started
         child.announced = True
@@ -234,7 +270,16 @@ class Supervisor:
             for port, kind in self._graph.outputs_of(stage).items()
         }
         graph = graph_to_json(self._graph)
-        task = Manifest(self._run, self._endpoint, str(self.recording), graph, self._settings, topics)
+        task = Manifest(
+            self._run,
+            self._endpoint,
+            str(self.recording),
+            graph,
+            self._settings,
+            topics,
+            network=self._network,
+            secret=self._secret,
+        )
         return self._spawn(Process(RECORDER, 0), "runner.recorder", msgspec.json.encode(task))
 
     def _start(self, process: Process) -> _Child:
@@ -253,12 +298,32 @@ class Supervisor:
             numbers=progress.numbers,
             started=progress.started,
             consumed=tuple(progress.consumed),
+            network=self._network,
+            secret=self._secret,
+            past=str(self.recording.absolute()) if self._relives(process) else "",
         )
-        return self._spawn(process, "runner.host", msgspec.json.encode(task))
+        host = self._graph.host_of(process.stage, process.replica)
+        if self._hosts is not None and host is not None and host != self._hosts.network.host:
+            log = self._log_of(process)
+            child = _Child(process, self._hosts.start(host, process, task, log), log)
+        else:
+            child = self._spawn(process, "runner.host", msgspec.json.encode(task))
+        child.watch = self._watch_of(process)
+        return child
+
+    def _watch_of(self, process: Process) -> Watch:
+        return Watch(self._graph.nodes[process.stage].limits)
+
+    def _relives(self, process: Process) -> bool:
+        kind = self._graph.nodes[process.stage].type.cls
+        return kind.stateful and not kind.device and process.incarnation > 0
 
     def _spawn(self, process: Process, module: str, task: bytes) -> _Child:
-        log = self.directory / "log" / f"{process.stage}-{process.replica}.txt"
+        log = self._log_of(process)
         return _Child(process, spawn(module, task=task, log=log), log)
+
+    def _log_of(self, process: Process) -> Path:
+        return self.directory / "log" / f"{process.stage}-{process.replica}.txt"
 
     def _start_viewer(self) -> _Child:
         log = self.directory / "log" / "viewer.txt"
@@ -279,52 +344,75 @@ class Supervisor:
                 return end
 
     def _look_after_children(self) -> End | None:
-        if self._recorder is not None and self._recorder_died():
-            return End(1, f"the recorder {self._recorder.reason()}")
+        if self._recorder is not None:
+            self._check(self._recorder)
+            if self._recorder_died():
+                return End(1, f"the recorder {self._recorder.reason()}")
         for child in list(self._children.values()):
-            if child.retires_by is not None and time.monotonic() > child.retires_by:
-                signal_group(child.handle, signal.SIGKILL)
-            if child.handle.poll() is not None:
-                end = self._replace(child)
-                if end is not None:
-                    return end
-        return None
+            if child.handle.poll() is None:
+                self._check(child)
+            elif child.heir is not None:
+                self._succeed(child, *child.heir)
+            elif (end := self._replace(child)) is not None:
+                return end
+        return None if self._hosts is None else self._look_after_hosts(self._hosts)
+
+    def _look_after_hosts(self, hosts: Hosts) -> End | None:
+        """Says who is waited for; ends the graph where one that is needed stays away."""
+        for child in self._children.values():
+            if hosts.waits(child.process):
+                child.started, child.watch = time.monotonic(), self._watch_of(child.process)
+                child.watch = Watch(self._graph.nodes[child.process.stage].limits)
+        hosts.remind()
+        reason = hosts.overdue(self._graph.hosts_of_stages())
+        return None if reason is None else End(1, reason)
+
+    def _check(self, child: _Child) -> None:
+        """Kills a process that hangs or has grown too large, after it has said where it is."""
+        now, name = time.monotonic(), self._name_of(child.process.stage, child.process.replica)
+        change = child.watch.look(now, self._pulses.of(child.process), ready=child.announced)
+        if change:
+            self._say(f"{name} {change}", "warning")
+        if not child.condemned and (fault := child.watch.fault()):
+            child.condemned, child.dies_at = fault, now + DUMP_SECONDS
+            child.handle.send_signal(DUMP)
+        if now > min(child.dies_at, child.retires_by or child.dies_at):
+            signal_group(child.handle, signal.SIGKILL)
 
     def _replace(self, child: _Child) -> End | None:
         """Restarts a dead process within its budget; otherwise says why the graph ends."""
         process, name = child.process, self._name_of(child.process.stage, child.process.replica)
+        reason = child.reason(self._pulses.of(process))
         if child.handle.returncode == EXIT_REFUSED:
-            return End(EXIT_REFUSED, f"{name}: {child.reason()}")
-        if child.retires_by is not None:
-            self._succeed(child, ASKED, child.crashes)
+            return End(EXIT_REFUSED, f"{name}: {reason}")
+        if child.retires_by is not None and not child.condemned:
+            self._say(f"{name} was {ASKED}", "info")
+            self._mourn(child, ASKED, child.crashes)
             return None
         budget = self._graph.nodes[process.stage].restarts
         if (process.stage, process.replica) in self._absent or child.crashes >= budget:
             when = "at start-up" if (process.stage, process.replica) in self._absent else f"after {budget} restarts"
             self._show_output(child)
-            return End(1, f"{name} failed {when}: {child.reason()}")
-        self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {child.reason()}", "warning")
-        if child.handle.returncode < 0:
-            self._show_output(child)
-        self._succeed(child, child.reason(), child.crashes + 1)
+            return End(1, f"{name} failed {when}: {reason}")
+        self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")
+        self._show_output(child)
+        self._mourn(child, reason, child.crashes + 1)
         return None
 
+    def _mourn(self, child: _Child, reason: str, crashes: int) -> None:
+        """Tells everybody that a process is replaced. What it leaves behind must be known first."""
+        child.heir, child.dies_at = (reason, crashes), time.monotonic()
+        self._publish_restart(child.process, reason)
+
     def _succeed(self, child: _Child, reason: str, crashes: int) -> None:
-        """Puts a new process in the place of one that has gone."""
+        """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
-        self._publish_restart(process, reason)
-        self._settle(child)
+        waits = child.announced and process not in self._settled
+        if waits and time.monotonic() < child.dies_at + SETTLE_SECONDS:
+            return
         successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
         successor.restarted_because, successor.crashes = reason, crashes
         self._children[process.stage, process.replica] = successor
-
-    def _settle(self, child: _Child) -> None:
-        """Waits until all that the recorder has of a dead process is known here."""
-        deadline = time.monotonic() + SETTLE_SECONDS
-        while child.announced and child.process not in self._settled and time.monotonic() < deadline:
-            if self._recorder_died():
-                return
-            time.sleep(TICK_SECONDS / 5)
 
     def _publish_restart(self, process: Process, reason: str) -> None:
         self._publish(port_name(Restarted), Restarted(stage=process.stage, replica=process.replica, reason=reason))
@@ -360,6 +448,12 @@ class Supervisor:
         self._terminal.plain(f"recording {verdict}")
         return end if complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
 
+    def _dismiss(self, end: End) -> End:
+        """Tells the other hosts how it ended."""
+        if self._hosts is not None:
+            self._hosts.close(end.code, end.reason)
+        return end
+
     # ------------------------------------------------------------------------------------------ what is asked
 
     def _serve(self) -> None:
@@ -394,7 +488,7 @@ class Supervisor:
         if old is None or not old.announced:
             raise Refused(f"{name} is not ready yet")
         old.retires_by = time.monotonic() + RETIRE_SECONDS
-        os.kill(old.handle.pid, signal.SIGUSR1)
+        old.handle.send_signal(signal.SIGUSR1)
         while (new := self._children[found[name]]) is old or not new.announced:
             if self._stopping.is_set():
                 raise Refused(f"the graph ended before {name} was back")
@@ -416,6 +510,7 @@ class Supervisor:
             ready=self._is_ready(),
             processes=tuple(map(self._process_status, children)),
             topics=topics_of(self._graph),
+            published={f"{SUPERVISOR}/{port}": number for port, number in list(self._numbers.items())},
         )
 
     def _process_status(self, child: _Child) -> ProcessStatus:
@@ -442,6 +537,9 @@ class Supervisor:
         self._terminal.show(SUPERVISOR, text, level)
         line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
         self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
+
+    def _complain(self, text: str) -> None:
+        self._say(text, "error")
 
     def _warn(self, text: str) -> None:
         self._say(text, "warning")
