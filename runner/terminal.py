@@ -1,5 +1,6 @@
 """What people see while a graph runs: one line at a time, with the time since the start and who says it."""
 
+import os
 import sys
 import threading
 import time
@@ -37,5 +38,14 @@ class Terminal:
     def _print(self, line: str, level: Level) -> None:
         colour = _COLOURS[level] if self._colours else ""
         with self._lock:
-            self._stream.write(f"{colour}{line}{_RESET if colour else ''}\n")
-            self._stream.flush()
+            try:
+                self._stream.write(f"{colour}{line}{_RESET if colour else ''}\n")
+                self._stream.flush()
+            except OSError:  # the terminal is gone, or the pipe's reader: the recording has it all
+                self._discard()
+
+    def _discard(self) -> None:
+        """Sends what is still to be printed nowhere."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)
