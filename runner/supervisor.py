@@ -167,8 +167,9 @@ class Supervisor:
 
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
+                signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
         self._connect()
         self._terminal.show(SUPERVISOR, f"run {self._run} on {self._endpoint}")
         try:
