@@ -44,7 +44,7 @@ class ParticleFilter(Stage):
         without: tuple[str, ...] = ()
         """Improvements over the paper's plain form that are switched off, each by its name."""
         device: Literal["auto", "cpu", "cuda"] = "cpu"
-        """What weighs the particles. ``auto`` takes a GPU where there is one; its costs differ in the last bits."""
+        """Where an object's filter runs. ``auto`` takes a GPU where there is one; its random numbers are its own."""
 
         def __post_init__(self) -> None:
             if self.form not in ("default", "paper"):

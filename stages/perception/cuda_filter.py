@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runner.contract import Refused
 from stages.perception.cuda_batch import Batch, Launch, Look, put
 from stages.perception.cuda_evolution import DONE, SIZE, STEP, evolve
 from stages.perception.cuda_kernels import NOTHING
@@ -23,6 +24,8 @@ from stages.scene.catalogue import Floats
 if TYPE_CHECKING:
     from stages.perception.particle_filter import FilterSettings
 
+_SHARED_BYTES = 48 * 1024
+"""What a block may have without asking the driver for more."""
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -39,6 +42,11 @@ class CudaEvolution:
         self._plan = list(plan)
         self._queued = 0
         self._capacity = max([len(p.poses) for p in populations] + [step.count for step in plan])
+        if self._shared_bytes() > _SHARED_BYTES:
+            raise Refused(
+                f"particle_filter.particles is {self._capacity}; a GPU's block keeps the energies of at most "
+                f"{_SHARED_BYTES // 4 - self._threads}"
+            )
         self._lay_out(populations)
         self._directions = put(np.stack([p.directions for p in populations]), np.float32)
         self._tables = _tables(populations, self._batch, self._plan, settings, self._directions)
@@ -70,9 +78,13 @@ class CudaEvolution:
             for h, sizes in enumerate(self._sizes)
         ]
 
+    def _shared_bytes(self) -> int:
+        """What ``evolve`` keeps in shared memory."""
+        return 4 * (self._threads + self._capacity)
+
     def _queue(self, step: Step, stream: Any) -> None:
         self._batch.write_costs(self._poses, self._objects, self._windows, self._changes, stream=stream)
-        evolve[len(self._state), self._threads, stream, 4 * (self._threads + self._capacity)](
+        evolve[len(self._state), self._threads, stream, self._shared_bytes()](
             self._changes, self._poses, self._following, self._objects, *self._tables, self._state, self._polished,
             self._history, self._traces,
         )  # fmt: skip

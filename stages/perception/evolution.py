@@ -112,7 +112,8 @@ class Evolution(Protocol):
 
 def evolved(populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings) -> Evolution:
     """All populations after the phase; each ends as it would alone, on a GPU they go together."""
-    evolution = _evolution(populations, plan, settings)
+    # A schedule of one iteration has no second half: nothing to send to a device.
+    evolution = _evolution(populations, plan, settings) if plan else HostEvolution(populations, plan, settings)
     while evolution.iterate(_CHECKED):
         pass
     return evolution
