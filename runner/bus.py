@@ -60,6 +60,8 @@ BLOCK_FOR_US = 600_000_000
 REST_SECONDS = 0.001
 """How long callbacks wait for others to be called with."""
 FLUSH_SECONDS = 1.0
+GUEST_MS = 10_000
+"""How long a guest calls a process that does not take the call."""
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
 RECORDER = "recorder"
@@ -140,16 +142,18 @@ class Bus:
         connect: str | None = None,
         network: Network | None = None,
         secret: str = "",
+        guest: bool = False,
     ):
         """``connect`` is called first; without a ``network`` all of it stays on loopback.
 
-        What is published without the run's ``secret`` is refused by its processes.
+        What is published without the run's ``secret`` is refused by its processes. A ``guest`` speaks with the
+        process it connects to and with nobody else: were it to stand still, no other would wait for it.
 
         Raises Refused where this machine cannot listen as it is told.
         """
         self._run = run
         self._secret = secret
-        self._session = _open(_config(listen, connect, network))
+        self._session = _open(_config(listen, connect, network, mode="client" if guest else None))
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._memory = SharedMemory()
@@ -388,8 +392,8 @@ def _config(listen: str | None, connect: str | None, network: Network | None, mo
         "listen/endpoints": [] if mode == "client" else [listen or own],
         "connect/endpoints": [connect] if connect else [],
         # A router may be started after those that call it.
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
+        "connect/timeout_ms": GUEST_MS if mode == "client" and not routed else -1,
+        "connect/exit_on_failure": mode == "client" and not routed,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
         # Large messages are put into shared memory by :meth:`Bus.load`, once for all who read them.

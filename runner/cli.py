@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from runner.commands import Command, graphs, inspect, recordings, replay
+from runner.commands import Command, graphs, inspect, keys, live, recordings, replay
 from runner.contract import Refused
 
 EXIT_REFUSED = 2
@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (graphs, recordings, inspect, replay):
+    for group in (graphs, live, recordings, inspect, replay, keys):
         group.add_commands(commands)
     return parser
 

@@ -31,7 +31,7 @@ def _origin(recording: Recording) -> Iterator[str]:
     yield f"{recording.path}: {recording.verdict}"
     yield f"graph     {run.get('name')} (seed {run.get('seed')}{''.join(f', --set {text}' for text in settings)})"
     yield f"started   {run.get('started')}, lasted {seconds(_duration_ns(recording))}"
-    size = _bytes(recording.path.stat().st_size)
+    size = byte_count(recording.path.stat().st_size)
     yield f"size      {size}, {len(recording.messages)} messages, {_restarts(recording)}"
     yield f"revision  {run.get('revision') or 'unknown'}"
     yield f"machine   {machine.get('processor')}, Python {machine.get('python')}, {machine.get('blas')}"
@@ -49,7 +49,7 @@ def _topic_row(topic: str, messages: list[Located]) -> Cells:
     times = [message.log_time_ns for message in messages]
     span = (max(times) - min(times)) * 1e-9
     rate = f"{(len(messages) - 1) / span:.2f}" if span > 0 else "-"
-    return topic, messages[0].type, str(len(messages)), _bytes(sum(message.size for message in messages)), rate
+    return topic, messages[0].type, str(len(messages)), byte_count(sum(message.size for message in messages)), rate
 
 
 def stage_times(steps: Iterable[Step]) -> list[str]:
@@ -120,7 +120,8 @@ def seconds(nanoseconds: float) -> str:
     return f"{seconds:.2f} s" if seconds >= 1 else f"{seconds * 1e3:.2f} ms"
 
 
-def _bytes(count: float) -> str:
+def byte_count(count: float) -> str:
+    """Bytes for people to read."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.4g} {unit}"

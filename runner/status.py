@@ -66,6 +66,8 @@ class RunStatus(msgspec.Struct, frozen=True):
     """Whether every process has been ready at least once, and the recorder is."""
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
+    published: dict[str, int] = {}
+    """Messages of the supervisor's own, by topic."""
 
 
 class Rates:

@@ -22,9 +22,12 @@ class Terminal:
         self._started = time.monotonic()
         self._lock = threading.Lock()
 
-    def show(self, who: str, text: str, level: Level = "info") -> None:
-        """Prints ``12.3 s  who  text``; further lines of the text keep the whole width."""
-        elapsed = time.monotonic() - self._started
+    def show(self, who: str, text: str, level: Level = "info", *, seconds: float | None = None) -> None:
+        """Prints ``12.3 s  who  text``; further lines of the text keep the whole width.
+
+        ``seconds`` since the start of the graph; since that of this terminal by default.
+        """
+        elapsed = time.monotonic() - self._started if seconds is None else seconds
         head = f"{elapsed:7.1f} s  {who:<{WIDTH}} "
         for line in text.splitlines() or [""]:
             self._print(f"{head}{line}".rstrip(), level)

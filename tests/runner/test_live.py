@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from runner.bus import Bus, free_endpoint
 from runner.calls import CallRequest, Calls, Progress
-from runner.codec import Envelope, open_envelope, unpack
+from runner.codec import Envelope, open_envelope, pack, unpack
 from runner.contract import Refused
+from runner.echo import lines_of
 from runner.graph import load_graph
 from runner.live import Live
 from runner.recording import Recording
@@ -276,3 +278,136 @@ def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) ->
     steps = [step for step in Recording(finished.recording).steps if step.stage == "doubler"]
     assert {step.outcome for step in steps} == {"done"}
     assert {step.incarnation for step in steps} == {0, 1}
+
+
+# ------------------------------------------------------------------------------------------ as a user types it
+
+
+def test_ps_and_topic_list_show_what_runs(account: Run) -> None:
+    assert runner("call", "account", "add", "amount=2").returncode == 0
+    lines = runner("ps").stdout.splitlines()
+    assert lines[0].startswith(f"{account.entry.run}: ")
+    assert lines[1].split() == [
+        "process",
+        "state",
+        "pid",
+        "cpu",
+        "memory",
+        "queue",
+        "steps/s",
+        "restarts",
+        "last",
+        "reason",
+    ]
+    assert [line.split()[0] for line in lines[2:]] == ["recorder", "counter", "account"]
+    topics = {line.split()[0]: line.split()[1:] for line in runner("topic", "list").stdout.splitlines()}
+    assert topics["supervisor/account_add"] == ["Add", "1", "0.0", "0", "B", "account.add"]
+    assert topics["account/sum"][-1] == "nobody"
+
+
+def test_a_topic_is_measured_by_headers_and_shown_without_its_type(account: Run) -> None:
+    assert re.search(
+        r"\d+\.\d\d per second: every .*, \d+ messages", runner("topic", "hz", "counter/number", "-n", "2").stdout
+    )
+    assert re.search(r"B/s: 1\d\d.* each, smallest", runner("topic", "bw", "counter.number", "-n", "2").stdout)
+    shown = runner("topic", "echo", "counter/number", "-n", "2").stdout.splitlines()
+    assert re.fullmatch(r"counter.number#\d+: Number, \d+ B", shown[0])
+    assert re.fullmatch(r"  value: \d+", shown[1])
+    assert len(shown) == 6
+    refused = runner("topic", "echo", "counter/numbr")
+    assert refused.returncode == 2
+    assert "no topic 'counter/numbr'; did you mean 'counter/number'" in refused.stderr
+
+
+def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
+    tool = subprocess.Popen(
+        [sys.executable, "-m", "runner.cli", "topic", "echo", "counter/number"], stdout=subprocess.PIPE, text=True
+    )
+    assert tool.stdout is not None
+    assert tool.stdout.readline()
+    tool.send_signal(signal.SIGSTOP)
+    with Live(account.entry) as live:
+        seen = live.status().published
+        assert call(live, "collect", count="20").done
+        assert live.status().published != seen
+    tool.kill()
+    tool.communicate()
+
+
+def test_log_lines_of_a_run_and_of_the_last_one(account: Run) -> None:
+    assert runner("call", "account", "add", "amount=2").stdout.splitlines()[0].endswith("account          2 added")
+    wait_for(lambda: "2 added" in runner("logs", "account").stdout)
+    follower = subprocess.Popen(
+        [sys.executable, "-m", "runner.cli", "logs", "-f"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert read_until(follower, "2 added")
+    assert runner("call", "account", "add", "amount=0").returncode == 2
+    assert read_until(follower, "nothing to add")
+    assert runner("down").stdout.startswith(f"{account.entry.run} has ended")
+    assert not runs()
+    assert follower.wait(30) == 0
+    follower.communicate()
+    last = runner("logs", "--recordings", str(account.folder)).stdout
+    assert "2 added" in last
+    assert "nothing to add" in last
+    refused = runner("logs", "acount", "--recordings", str(account.folder))
+    assert "nothing from a stage 'acount'; did you mean 'account'" in refused.stderr
+
+
+def test_two_graphs_never_meet(account: Run, tmp_path: Path) -> None:
+    other = Run(tmp_path / "other", ACCOUNT, "counter.count=0")
+    try:
+        refused = runner("topic", "list")
+        assert refused.returncode == 2
+        assert (
+            f"2 graphs are running: choose one with --run; valid: {account.entry.run}, {other.entry.run}"
+            in refused.stderr
+        )
+        shown = runner("ps").stdout
+        assert account.entry.run in shown
+        assert other.entry.run in shown
+        silent = runner("topic", "hz", "counter/number", "-n", "2", "--run", other.entry.run)
+        assert silent.stdout.splitlines() == ["no messages", "no messages"]
+        assert runner("call", "account", "add", "amount=2", "--run", other.entry.run).returncode == 0
+        with Live(account.entry) as live:
+            assert call(live, "add", amount="40").emitted == ("account.sum#0",)
+        assert runner("down", "--run", other.entry.run).returncode == 0
+        assert [found.run for found in runs()] == [account.entry.run]
+    finally:
+        other.close()
+
+
+# ------------------------------------------------------------------------------------------ echo
+
+
+def test_any_message_becomes_text() -> None:
+    body = {
+        "rgb": np.arange(60, dtype=np.uint8).reshape(4, 5, 3),
+        "T": np.eye(2),
+        "depth": np.array([np.nan] + [0.5] * 19, np.float32),
+        "mask": np.arange(20) < 3,
+        "names": ["cup", "jar"],
+        "items": [{"name": "cup", "cost": 0.1 + 0.2}],
+        "empty": [],
+        "many": [{"n": n} for n in range(40)],
+        "text": "one\ntwo",
+    }
+    raw = msgspec.Raw(
+        msgspec.msgpack.encode(body, enc_hook=lambda array: [array.dtype.name, array.shape, array.tobytes()])
+    )
+    lines = list(lines_of(pack(Envelope("camera.frame#3", "world.look#0", 5, "Frame", 1, ("world.snapshot#1",), raw))))
+    assert re.fullmatch(r"camera.frame#3: Frame, [\d.]+ k?B from world.snapshot#1", lines[0])
+    assert lines[1:11] == [
+        "  rgb: uint8 (4, 5, 3) 0 .. 59, mean 29.5",
+        "  T: float64 (2, 2) [[1, 0], [0, 1]]",
+        "  depth: float32 (20) 0.5 .. 0.5, mean 0.5, 1 not finite",
+        "  mask: bool (20) 3 of 20 true",
+        "  names: [cup, jar]",
+        "  items:",
+        "    -",
+        "      name: cup",
+        "      cost: 0.3",
+        "  empty: []",
+    ]
+    assert lines[-4:] == ["    ... and 8 more", "  text: |", "      one", "      two"]
+    assert next(lines_of(b"\xc1garbage")).startswith("unreadable, 8 B: ")
