@@ -33,6 +33,7 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     subjects = {"hosts": list(network.hosts), **({"others": others} if others else {})}
     policies = {"hosts": "take part", "others": "give orders"}
     return {
+        "transport/link/protocols": ["tls"],
         "transport/link/tls": _tls(credentials),
         "access_control": {
             "enabled": True,
