@@ -27,7 +27,7 @@ from runner.children import bound
 from runner.codec import CodecError, Envelope, open_envelope, unpack
 from runner.container import Container, Entry, Growing, is_being_written, open_file
 from runner.contract import Refused
-from runner.drawing import Views
+from runner.drawing import Drawing, Views
 from runner.graph import Graph, graph_from_json, node_entry
 from runner.recording import JOURNAL, LOG, RUN, Recording, split_id
 
@@ -52,15 +52,21 @@ class Show:
 
     def draw(self, sealed: Envelope) -> None:
         """Draws one message; what cannot be drawn is named on stderr and left out."""
-        stage, _, port = split_id(sealed.id)[0].partition(".")
-        try:
-            kind = self._graph.outputs_of(stage).get(port)
-            if kind is not None:
-                message = open_envelope(kind, sealed)
-                self._canvas.show(self._views.draw(message), time_ns=sealed.time_ns)
-        except Exception as error:  # the rest of the recording is still worth seeing
-            reason = str(error).partition("\n")[0]
-            print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
+        self._canvas.show(drawn(self._graph, self._views, sealed), time_ns=sealed.time_ns)
+
+
+def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
+    """What one message shows; what cannot be drawn is named on stderr and left out."""
+    stage, _, port = split_id(sealed.id)[0].partition(".")
+    found: list[Drawing] = []
+    try:
+        kind = graph.outputs_of(stage).get(port)
+        if kind is not None:
+            found.extend(views.draw(open_envelope(kind, sealed)))
+    except Exception as error:  # the rest of the recording is still worth seeing
+        reason = str(error).partition("\n")[0]
+        print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
+    return found
 
 
 def load_views(graph: Graph) -> Views:

@@ -2,13 +2,13 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.codec import Envelope, Step, pack
+from runner.codec import Envelope, LogLine, Step, pack
 from runner.graph import Graph, Node, graph_to_json, load_graph
 from runner.inbox import Inbox, Ready
 from runner.recorder import Manifest, RecordingWriter, topic
@@ -26,7 +26,9 @@ def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manife
     return Manifest("test", "", str(path), graph_to_json(graph), settings, topics)
 
 
-def record_toys(folder: Path, *settings: str, keep: Keep = lambda record: record) -> tuple[Path, Verdict]:
+def record_toys(
+    folder: Path, *settings: str, keep: Keep = lambda record: record, log: Iterable[LogLine] = ()
+) -> tuple[Path, Verdict]:
     """Runs the toy graph in this process and records what ``keep`` lets through."""
     path = folder / "toys.mcap"
     settings = (f"sink.path={folder / 'out.txt'}", *settings)
@@ -36,6 +38,8 @@ def record_toys(folder: Path, *settings: str, keep: Keep = lambda record: record
         kept = keep(record)
         if kept is not None:
             writer.put(type(kept), pack(kept))
+    for line in log:
+        writer.put(LogLine, pack(line))
     return path, writer.close()
 
 
