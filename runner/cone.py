@@ -22,7 +22,7 @@ from runner.codec import CodecError, Envelope, Step, pack, unpack
 from runner.contract import Refused
 from runner.graph import Graph, Node
 from runner.inbox import Inbox, Mismatched, Ready
-from runner.recording import Recording, split_id
+from runner.recording import Recording, replicated, split_id
 from runner.step import Executor, receive, step_time
 from runner.workshop import Forked
 
@@ -160,8 +160,15 @@ class Cone:
         files = folder / node.name
         files.mkdir()
         idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
-        expected = deque(key for key in self._ranks if key[0] == node.name)
-        return _Stage(node, Inbox(node), idle, expected)
+        return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+
+    def _expected(self, node: Node) -> list[Key]:
+        """The recorded steps of a stage, in order: the journal's, or where replicas shared them, that of the looks."""
+        keys = [key for key in self._ranks if key[0] == node.name]
+        if node.name not in replicated(self._recording.graph):
+            return keys
+        place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
+        return sorted(keys, key=lambda key: (split_id(key[2]), place.get(key[1], len(place)), key[3]))
 
     def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
         log = folder / f"{node.name}-{len(self._forked)}.txt"

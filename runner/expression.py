@@ -1,6 +1,7 @@
 """Conditions on messages, such as ``ranker.scene_estimate.winner > 0``: a small language of its own, never ``eval``.
 
-A name is ``stage.port`` followed by fields and indices. There are comparisons, ``in``, ``and``, ``or``, ``not``,
+A name is ``stage.port`` followed by fields and indices; messages of several ports are those of one lineage.
+There are comparisons, ``in``, ``and``, ``or``, ``not``,
 ``+ - * / // %``, numbers, text, ``None``, ``True``, ``False``, lists, and the functions ``len abs min max any all``.
 A field of a list of records is the list of that field: ``any(ranker.scene_estimate.objects.cost > 1)``.
 """
@@ -46,7 +47,7 @@ _VALID = f"comparisons, and, or, not, + - * / // %, indices, in, {', '.join(FUNC
 
 
 class Expression:
-    """A checked condition on the newest message of one or more ports."""
+    """A checked condition on messages of one or more ports."""
 
     def __init__(self, text: str, ports: Mapping[str, Mapping[str, type[Message]]]) -> None:
         """``ports`` has the output ports of every stage. Raises Refused, naming the part that is not valid."""
@@ -59,7 +60,7 @@ class Expression:
             raise self._refused("names no message; valid: stage.port.field, for example camera.frame.index > 3")
 
     def holds(self, messages: Mapping[str, Message]) -> bool:
-        """Whether it holds for the newest message by topic; false while one is still to come.
+        """Whether it holds for messages by topic; false while one is still to come.
 
         Raises Refused where it asks a message for what it does not have.
         """

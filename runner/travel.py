@@ -6,6 +6,7 @@ import code
 import importlib
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -88,15 +89,16 @@ def _existing(recording: Recording, id: str) -> str:
 
 
 def first_match(recording: Recording, graph: Graph, condition: str) -> str | None:
-    """The first recorded message after which a condition holds."""
+    """The first recorded message after which a condition holds for the newest messages of its lineage."""
     ports = {name: graph.outputs_of(name) for name in (*graph.nodes, SUPERVISOR)}
     expression = Expression(condition, ports)
-    newest: dict[str, Message] = {}
+    newest: dict[str, dict[str, Message]] = defaultdict(dict)
     for id, located in recording.messages.items():
         if located.topic in expression.topics:
             stage, _, port = located.topic.partition("/")
-            newest[located.topic] = _opened(recording.envelope(id), ports[stage][port])
-            if expression.holds(newest):
+            sealed = recording.envelope(id)
+            newest[sealed.lineage][located.topic] = _opened(sealed, ports[stage][port])
+            if expression.holds(newest[sealed.lineage]):
                 return id
     return None
 

@@ -1,0 +1,111 @@
+"""Replays one recording again and again while the machine is busy, and says how fast a replay is.
+
+`python -m benchmarks.replays FILE --times 100 --load 4` prints how many of the replays were identical and, for the
+median replay, its time against what the stages computed when they were recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).parents[1]
+IDENTICAL = re.compile(r"^IDENTICAL: (\d+) messages", re.MULTILINE)
+TIMES = re.compile(r"handlers took ([\d.]+) s, when recorded ([\d.]+) s; constructing the stages ([\d.]+) s")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One replay."""
+
+    identical: bool
+    messages: int
+    seconds: float
+    """Wall time from the start of the command to its end."""
+    computed: float
+    """Seconds inside handlers, all processes together."""
+    recorded: float
+    """The same when it was recorded."""
+    constructing: float
+    verdict: str
+
+
+def replay_once(path: Path, *, workers: int | None = None, settings: Sequence[str] = ()) -> Outcome:
+    """`runner replay FILE --verify` in a process of its own."""
+    command = [sys.executable, "-m", "runner.cli", "replay", str(path), "--verify"]
+    command += [] if workers is None else ["--workers", str(workers)]
+    command += [part for setting in settings for part in ("--set", setting)]
+    began = time.monotonic()
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    seconds = time.monotonic() - began
+    found, times = IDENTICAL.search(done.stdout), TIMES.search(done.stdout)
+    computed, recorded, constructing = map(float, times.groups()) if times else (0.0, 0.0, 0.0)
+    verdict = (done.stdout + done.stderr).strip().splitlines()[-1]
+    identical = done.returncode == 0 and found is not None
+    return Outcome(identical, int(found[1]) if found else 0, seconds, computed, recorded, constructing, verdict)
+
+
+@contextmanager
+def busy(loops: int) -> Generator[None]:
+    """Keeps so many processes computing meanwhile."""
+    children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+def main() -> None:
+    """Prints the table; exits 1 where a replay was not identical."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--times", type=int, default=1, help="replays")
+    parser.add_argument("--load", type=int, default=0, help="busy loops meanwhile")
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="stages at the same time")
+    options = parser.parse_args()
+    with busy(options.load):
+        outcomes = list(_replays(options.file.absolute(), options.times, options.workers))
+    for line in report(outcomes, options.workers, options.load):
+        print(line)
+    sys.exit(not all(outcome.identical for outcome in outcomes))
+
+
+def _replays(path: Path, times: int, workers: int) -> Iterator[Outcome]:
+    for number in range(1, times + 1):
+        outcome = replay_once(path, workers=workers)
+        if not outcome.identical:
+            print(f"replay {number}: {outcome.verdict}", flush=True)
+        yield outcome
+
+
+def report(outcomes: Sequence[Outcome], workers: int, load: int) -> Iterator[str]:
+    """The counts, then the times of the median replay."""
+    middle = sorted(outcomes, key=lambda outcome: outcome.seconds)[len(outcomes) // 2]
+    identical = sum(outcome.identical for outcome in outcomes)
+    counts = f"{identical} of {len(outcomes)} replays identical, {middle.messages} messages each"
+    yield f"{counts}, {load} busy loops meanwhile"
+    rows = (
+        ("stages' compute when recorded", middle.recorded),
+        (f"  shared by {workers} workers", middle.recorded / workers),
+        ("stages' compute in the replay", middle.computed),
+        ("constructing the stages", middle.constructing),
+        ("replay, wall (median)", median(outcome.seconds for outcome in outcomes)),
+    )
+    yield from (f"{name:<32}{seconds:8.2f} s" for name, seconds in rows)
+    yield f"{'wall / recorded compute':<32}{middle.seconds / max(middle.recorded, 1e-9):8.2f}"
+    yield f"{'wall / compute per worker':<32}{middle.seconds * workers / max(middle.recorded, 1e-9):8.2f}"
+
+
+if __name__ == "__main__":
+    main()
