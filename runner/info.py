@@ -12,6 +12,7 @@ from runner.codec import Step
 from runner.contract import Restarted
 from runner.graph import SUPERVISOR
 from runner.ports import port_name
+from runner.provenance import NUMERICAL
 from runner.recording import Located, Recording
 
 Cells = Sequence[str]
@@ -35,6 +36,15 @@ def _origin(recording: Recording) -> Iterator[str]:
     yield f"size      {size}, {len(recording.messages)} messages, {_restarts(recording)}"
     yield f"revision  {run.get('revision') or 'unknown'}"
     yield f"machine   {machine.get('processor')}, Python {machine.get('python')}, {machine.get('blas')}"
+    yield f"computes  fingerprint {recording.fingerprint}: {_packages(recording)}"
+    for path, found in recording.aspect("files", dict[str, str]()).items():
+        yield f"file      {path} {found[:16] if len(found) == 64 else found}"
+
+
+def _packages(recording: Recording) -> str:
+    packages = recording.aspect("packages", dict[str, str]())
+    shown = ", ".join(f"{name} {packages[name]}" for name in NUMERICAL if name in packages)
+    return f"{shown or 'no package'} of {len(packages)} packages"
 
 
 def _topics(recording: Recording) -> list[str]:

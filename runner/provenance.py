@@ -1,19 +1,22 @@
 """Where and with what a graph ran: package versions, source revision, machine, and the files its settings name."""
 
 import hashlib
+import itertools
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import yaml
 
 NUMERICAL = ("llvmlite", "mujoco", "numba", "numpy", "opencv-contrib-python-headless", "pyrender", "scipy", "torch")
 """Packages that compute: another version may round a float differently."""
 HASHED_BYTES = 64 * 2**20
-"""Larger files are named without a hash."""
+"""Larger files and folders are named without a hash."""
+HASHED_FILES = 1000
 
 
 def package_versions() -> dict[str, str]:
@@ -72,10 +75,28 @@ def _processor(key: str) -> str:
 
 
 def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of every file that a setting of the graph names, for example the catalogue."""
+    """SHA-256 of everything that a setting of the graph names: files, folders with all that is in them, and YAML files
+    with the files they name, for example the catalogue with its meshes."""
     texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
-    paths = [Path(text) for text in sorted(texts) if len(text) < 4096 and "\0" not in text]
-    return {str(path): _hash(path) for path in paths if path.is_file()}
+    hashes = {text: _hash(_parts(Path(text))) for text in sorted(texts) if len(text) < 4096 and "\0" not in text}
+    return {text: found for text, found in hashes.items() if found}
+
+
+def _parts(path: Path) -> list[Path]:
+    """The files that belong to a setting's file or folder; none where there is neither."""
+    if path.is_dir():
+        return sorted(inner for inner in itertools.islice(path.rglob("*"), HASHED_FILES) if inner.is_file())
+    if not path.is_file():
+        return []
+    named = {path.parent / text for text in _texts(_yaml(path))} if path.suffix in (".yaml", ".yml") else set[Path]()
+    return [path, *sorted(inner for inner in named if inner.is_file())]
+
+
+def _yaml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError):
+        return None
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -89,10 +110,14 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(inner)
 
 
-def _hash(path: Path) -> str:
-    if path.stat().st_size > HASHED_BYTES:
-        return f"not hashed, {path.stat().st_size} bytes"
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _hash(paths: Sequence[Path]) -> str:
+    size = sum(path.stat().st_size for path in paths)
+    if size > HASHED_BYTES:
+        return f"not hashed, {size} bytes"
+    hashes = [hashlib.sha256(path.read_bytes()) for path in paths]
+    if len(hashes) < 2:
+        return "".join(found.hexdigest() for found in hashes)
+    return hashlib.sha256(b"".join(found.digest() for found in hashes)).hexdigest()
 
 
 def portable(value: Any, root: Path) -> Any:

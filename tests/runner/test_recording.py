@@ -1,3 +1,4 @@
+import hashlib
 import io
 import json
 import shutil
@@ -16,6 +17,7 @@ from runner.container import Container, Growing, is_being_written
 from runner.contract import Refused
 from runner.graph import load_graph
 from runner.info import describe
+from runner.provenance import file_hashes
 from runner.recorder import RecordingWriter
 from runner.recording import Ledger, Recording, Verdict
 from tests.runner.recordings import TOYS, manifest, record_toys
@@ -88,6 +90,24 @@ def test_says_what_ran_where(toys: Path):
     assert json.loads(run["settings"])[0].startswith("sink.path=")
     assert json.loads(run["packages"])["numpy"] == np.__version__
     assert json.loads(run["machine"])["python"]
+    assert run["fingerprint"] == Recording(toys).fingerprint
+    text = describe(toys)
+    assert f"fingerprint {run['fingerprint']}: llvmlite" in text
+    assert f"numpy {np.__version__}" in text
+
+
+def test_hashes_all_that_a_setting_names(tmp_path: Path):
+    catalogue, mesh = tmp_path / "catalogue.yaml", tmp_path / "cup.ply"
+    catalogue.write_text("objects: {cup: {mesh: {file: cup.ply}}}\n")
+    settings = {"catalogue": str(catalogue), "mesh": str(mesh), "folder": str(tmp_path), "name": "cup"}
+    graph = {"stages": {"camera": {"config": settings}}}
+    found: list[dict[str, str]] = []
+    for content in ("a mesh", "another"):
+        mesh.write_text(content)
+        found.append(file_hashes(graph))
+    assert found[1].keys() == {str(catalogue), str(mesh), str(tmp_path)}
+    assert all(found[0][key] != found[1][key] for key in found[1])
+    assert found[1][str(mesh)] == hashlib.sha256(b"another").hexdigest()
 
 
 def test_refuses_to_overwrite(toys: Path):
