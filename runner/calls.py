@@ -45,8 +45,8 @@ class CommandType(msgspec.Struct, frozen=True):
     name: str
     text: str
     fields: tuple[Field, ...]
-    answer: str | None
-    """Output port whose next message ends the call."""
+    answers: tuple[str, ...]
+    """Output ports whose next message ends the call."""
 
 
 class CallRequest(msgspec.Struct, frozen=True):
@@ -85,7 +85,8 @@ Publish = Callable[[str, Command, Callable[[str], None]], None]
 @dataclass(slots=True)
 class _Call:
     stage: str
-    answer: str | None
+    answers: frozenset[str]
+    """Output ports."""
     lines: list[tuple[Level, str]] = field(default_factory=list[tuple[Level, str]])
     step: Step | None = None
     """The step that did it; of replicas, the first."""
@@ -107,8 +108,7 @@ class Calls:
     @property
     def answer_keys(self) -> list[str]:
         """``STAGE/PORT`` of everything that answers a command."""
-        kinds = [kind for node in self._graph.nodes.values() for kind in command_types(node)]
-        return sorted({f"{kind.stage}/{kind.answer}" for kind in kinds if kind.answer})
+        return sorted({f"{kind.stage}/{answer}" for kind in self.types() for answer in kind.answers})
 
     def types(self) -> list[CommandType]:
         """Every command of the graph."""
@@ -124,7 +124,7 @@ class Calls:
             nonlocal own
             own = id
             with self._changed:
-                self._calls[id] = _Call(request.stage, port_name(kind.answer) if kind.answer else None)
+                self._calls[id] = _Call(request.stage, frozenset(map(port_name, kind.answers)))
                 while len(self._calls) > KEPT:
                     self._calls.popitem(last=False)
 
@@ -182,9 +182,10 @@ class Calls:
             call.step = step
         if call.step is None:
             return
-        answers = [id for id in step.emitted if id.partition("#")[0] == f"{call.stage}.{call.answer}"]
+        wanted = {f"{call.stage}.{answer}" for answer in call.answers}
+        answers = [id for id in step.emitted if id.partition("#")[0] in wanted]
         call.payload = self._answers.get(answers[0], b"") if answers else b""
-        call.done = call.answer is None or bool(answers) or bool(call.step.error)
+        call.done = not call.answers or bool(answers) or bool(call.step.error)
 
 
 # ------------------------------------------------------------------------------------------ types of commands
@@ -238,7 +239,7 @@ def _command_type(node: Node, name: str, kind: type[Command]) -> CommandType:
         for info in msgspec.structs.fields(kind)
     )
     text = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
-    return CommandType(node.name, name, text, fields, port_name(kind.answer) if kind.answer else None)
+    return CommandType(node.name, name, text, fields, tuple(map(port_name, kind.answers)))
 
 
 def _spelled(kind: Any) -> str:

@@ -63,8 +63,10 @@ class Command(Message, frozen=True, kw_only=True):
     is recorded, journalled, replayed and delivered again after a restart like any other message.
     """
 
-    answer: ClassVar[type[Message] | None] = None
-    """What the stage emits, now or in a later step, when it has done what was asked; None where the step does it."""
+    answers: ClassVar[tuple[type[Message], ...]] = ()
+    """What the stage emits, now or in a later step, when it has done what was asked: one of these; none where the
+    step itself does it. A field ``success`` that is false makes the exit status of the call 1.
+    """
 
 
 class Finished(Message, frozen=True, kw_only=True):

@@ -21,6 +21,8 @@ from runner.tap import Header
 from runner.terminal import Terminal
 
 EXIT_REFUSED = 2
+SHOWN_LINES = 24
+"""Of an answer."""
 
 
 # ------------------------------------------------------------------------------------------ processes, topics
@@ -149,7 +151,8 @@ def commands_text(commands: Sequence[CommandType], stage: str | None) -> str:
 def _command_lines(command: CommandType) -> Iterator[str]:
     fields = " ".join(f"{one.name}=..." if one.default is None else f"[{one.name}=...]" for one in command.fields)
     yield f"runner call {command.stage} {command.name} {fields}".rstrip()
-    yield f"    {command.text}{f' Waits for its {command.answer}.' if command.answer else ''}"
+    answers = " or ".join(command.answers)
+    yield f"    {command.text}{f' Waits for its {answers}.' if answers else ''}"
     for one in command.fields:
         default = "" if one.default is None else f", {one.default} by default"
         yield f"    {one.name}: {one.type}{default}{f'. {one.text}' if one.text else ''}"
@@ -167,5 +170,13 @@ def show_progress(id: str, stage: str, news: Iterable[Progress]) -> int:
         if progress.done:
             done = f"{id} done"
             terminal.plain(f"{done}, emitted {', '.join(progress.emitted)}" if progress.emitted else done)
-            terminal.plain(*(lines_of(progress.answer) if progress.answer else ()))
+            return _show_answer(terminal, progress.answer) if progress.answer else 0
     return 0
+
+
+def _show_answer(terminal: Terminal, payload: bytes) -> int:
+    lines = list(lines_of(payload))
+    terminal.plain(*lines[:SHOWN_LINES])
+    if len(lines) > SHOWN_LINES:
+        terminal.plain(f"  ... and {len(lines) - SHOWN_LINES} lines more")
+    return int("  success: False" in lines)

@@ -1,9 +1,9 @@
-"""The scripted demonstration: shows a goal, disturbs it, asks for it back and checks every step of the way."""
+"""Goals shown and got back: by its script (shown, disturbed, restored) or as somebody asks for it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
@@ -15,9 +15,11 @@ from stages.messages import (
     LookRequest,
     Outcome,
     Plan,
+    Restore,
     RobotState,
     SceneGraph,
     Task,
+    Teach,
     Transfer,
     TransferRequest,
     Verdict,
@@ -34,6 +36,7 @@ class Phase(Enum):
     LOOKING = "a scene graph"
     PLANNING = "a plan"
     TRANSFERRING = "the outcome of a transfer"
+    IDLE = "a command"
     DONE = "nothing more"
 
 
@@ -41,6 +44,10 @@ class Phase(Enum):
 class State:
     """Where the episode stands; every handler replaces it as a whole."""
 
+    goals: dict[str, SceneGraph] = field(default_factory=dict[str, SceneGraph])
+    """What has been taught, by name. Never changed, only replaced."""
+    goal_name: str = ""
+    """The goal that is looked at or restored."""
     phase: Phase = Phase.ARRANGING
     purpose: str = "goal"
     """What the current scene is looked at for."""
@@ -51,6 +58,7 @@ class State:
     replans: int = 0
     transfers: int = 0
     goal: SceneGraph | None = None
+    """What is to be restored; None while it is being shown."""
     scene: SceneGraph | None = None
     transfer: Transfer | None = None
     """Requested, and its effect not seen yet."""
@@ -67,15 +75,21 @@ class Demonstrator(Stage):
 
     One :class:`State` and no clock. After each transfer the scene is perceived again and planned from again,
     since targets depend on poses; comparing the new plan with what the old one still had to do says whether
-    the plan was kept, repaired or replaced. Every way through ends in exactly one verdict.
+    the plan was kept, repaired or replaced. Every way through ends in exactly one verdict; without the script
+    the next command may follow.
     """
+
+    stateful = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
         """How long to persist."""
 
         catalogue: str
+        scripted: bool = True
+        """Shows a goal, disturbs it and restores it; else only what is called happens."""
         goal_name: str = "breakfast"
+        """Of the script."""
         n_objects: int = 0
         """Objects that the goal scene must show; 0 accepts any number."""
         repeats: int = 2
@@ -97,20 +111,34 @@ class Demonstrator(Stage):
             ):
                 if getattr(self, name) < least:
                     raise Refused(f"demonstrator.{name}={getattr(self, name)}: must be {least} or more")
-            if not self.goal_name.replace("-", "").replace("_", "").isalnum():
-                raise Refused(
-                    f"demonstrator.goal_name={self.goal_name!r}: must consist of letters, digits, - and _ only"
-                )
+            _refuse_odd_name(f"demonstrator.goal_name={self.goal_name!r}", self.goal_name)
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.load(Path(config.catalogue))
-        self._state = State()
+        self._state = State(goal_name=config.goal_name) if config.scripted else State(phase=Phase.IDLE)
 
     def on_start(self, ctx: Context) -> Arrangement:
         """Has the goal scene laid out."""
-        ctx.log(f'the person lays out the goal "{self._config.goal_name}"')
+        if self._config.scripted:
+            ctx.log(f'the person lays out the goal "{self._config.goal_name}"')
         return Arrangement(kind="goal")
+
+    def on_teach(self, teach: Teach, ctx: Context) -> LookRequest:
+        """Looks at what is to be remembered."""
+        _refuse_odd_name(f"name={teach.name!r}", teach.name)
+        self._begin(teach.name, None)
+        ctx.log(f'looks at the goal "{teach.name}"')
+        return self._look(f"goal {teach.name}")
+
+    def on_restore(self, restore: Restore, ctx: Context) -> LookRequest:
+        """Looks at what there is to do for a goal."""
+        goals = self._state.goals
+        if restore.name not in goals:
+            raise Refused(f"name={restore.name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
+        self._begin(restore.name, goals[restore.name])
+        ctx.log(f'restores the goal "{restore.name}"')
+        return self._look(f"restore {restore.name}")
 
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
         """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
@@ -157,6 +185,12 @@ class Demonstrator(Stage):
         self._state = replace(self._state, complaint=complaint, repeats=0)
         return self._look(f"after transfer {outcome.number}")
 
+    def _begin(self, name: str, goal: SceneGraph | None) -> None:
+        """Starts from anew with a goal, or with one that is yet to be seen."""
+        if self._state.phase is not Phase.IDLE:
+            raise Refused(f"busy: waits for {self._state.phase.value}; ask again after the verdict")
+        self._state = State(goals=self._state.goals, goal_name=name, goal=goal)
+
     def _look(self, purpose: str) -> LookRequest:
         self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
         suffix = f", look {self._state.repeats + 1}" if self._state.repeats else ""
@@ -179,11 +213,13 @@ class Demonstrator(Stage):
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
-        name = self._config.goal_name
-        self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start", repeats=0, goal=scene)
+        name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
         ctx.log(f'goal "{name}" remembered: {len(scene.objects)} objects, {len(scene.assertions)} assertions')
         yield Goal(name=name, scene=scene, pddl=goal_pddl(name, scene))
-        yield Arrangement(kind="start")
+        self._state = replace(self._state, goals=goals, goal=scene, phase=Phase.IDLE, repeats=0)
+        if self._config.scripted:
+            self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start")
+            yield Arrangement(kind="start")
 
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
@@ -196,7 +232,7 @@ class Demonstrator(Stage):
             why = self._state.complaint or f"{violated[0]} does not hold"
             return self._fail("executor", f"{self._state.transfers} transfers were not enough; {why}", ctx)
         self._state = replace(self._state, phase=Phase.PLANNING)
-        return Task(goal_name=self._config.goal_name, goal=goal, current=scene, avoid=self._avoided())
+        return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided())
 
     def _check_transfer(self, scene: SceneGraph) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan."""
@@ -241,9 +277,9 @@ class Demonstrator(Stage):
         violated: tuple[Assertion, ...] = ()
         if state.goal is not None and state.scene is not None:
             held, violated = satisfied(state.goal, state.scene, self._catalogue)
-        self._state = replace(state, phase=Phase.DONE)
+        self._state = replace(state, phase=Phase.DONE if self._config.scripted else Phase.IDLE)
         return Verdict(
-            goal_name=self._config.goal_name,
+            goal_name=state.goal_name,
             success=not failed_stage,
             failed_stage=failed_stage,
             reason=reason,
@@ -253,6 +289,12 @@ class Demonstrator(Stage):
             plans=state.plans,
             transfers=state.transfers,
         )
+
+
+def _refuse_odd_name(place: str, name: str) -> None:
+    """Goals are written to files of their names."""
+    if not name.replace("-", "").replace("_", "").isalnum():
+        raise Refused(f"{place}: must consist of letters, digits, - and _ only")
 
 
 def change_of_plan(expected: Sequence[Transfer], planned: Sequence[Transfer]) -> str:

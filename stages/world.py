@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
-from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.messages import Arrange, Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import Catalogue
 
 _DRIFT = 0.01
@@ -46,15 +47,14 @@ class World(Stage):
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
-        rng = np.random.default_rng([self._config.seed, int(arrangement.kind == "start")])
-        sample = tabletop.sample_goal if arrangement.kind == "goal" else tabletop.sample_start
-        for _ in range(_DRAWS):
-            layout = sample(self._goal, self._catalogue, rng)
-            self._simulation.arrange(layout)
-            if self._stands(layout):
-                ctx.log(f"{arrangement.kind} scene laid out: {', '.join(layout)}")
-                return self._state()
-        raise RuntimeError(f"no {arrangement.kind} scene of {self._goal} stood in {_DRAWS} draws")
+        self._lay_out(arrangement.kind, (), ctx)
+        return self._state()
+
+    def on_arrange(self, arrange: Arrange, ctx: Context) -> None:
+        """Lays out a scene when somebody asks for it, whatever the robot is doing."""
+        if arrange.draw < 0:
+            raise Refused(f"draw={arrange.draw} is negative; choose 0, 1, 2, ...")
+        self._lay_out(arrange.kind, (arrange.draw,) if arrange.draw else (), ctx)
 
     def on_look_request(self, look_request: LookRequest) -> Snapshot:
         """The world as it is now, for the simulated camera."""
@@ -77,6 +77,17 @@ class World(Stage):
         if robot_command.gripper_width is not None:
             self._simulation.move_gripper(robot_command.gripper_width)
         return self._state(error)
+
+    def _lay_out(self, kind: Literal["goal", "start"], draw: tuple[int, ...], ctx: Context) -> None:
+        rng = np.random.default_rng([self._config.seed, int(kind == "start"), *draw])
+        sample = tabletop.sample_goal if kind == "goal" else tabletop.sample_start
+        for _ in range(_DRAWS):
+            layout = sample(self._goal, self._catalogue, rng)
+            self._simulation.arrange(layout)
+            if self._stands(layout):
+                ctx.log(f"{kind} scene laid out: {', '.join(layout)}")
+                return
+        raise RuntimeError(f"no {kind} scene of {self._goal} stood in {_DRAWS} draws")
 
     def _stands(self, layout: tabletop.Layout) -> bool:
         poses = dict(zip(self._simulation.names, self._simulation.object_poses(), strict=True))

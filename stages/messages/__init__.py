@@ -11,9 +11,22 @@ from stages.messages.digest import Candidate, Candidates, Hypothesis, Observatio
 from stages.messages.robot import RobotCommand, RobotState
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, Snapshot
-from stages.messages.task import Arrangement, Goal, Outcome, Plan, Task, Transfer, TransferRequest, Verdict
+from stages.messages.task import (
+    Arrange,
+    Arrangement,
+    Goal,
+    Outcome,
+    Plan,
+    Restore,
+    Task,
+    Teach,
+    Transfer,
+    TransferRequest,
+    Verdict,
+)
 
 __all__ = [
+    "Arrange",
     "Arrangement",
     "Assertion",
     "Box",
@@ -34,6 +47,7 @@ __all__ = [
     "Pose",
     "Poses",
     "Posterior",
+    "Restore",
     "Rgb",
     "RobotCommand",
     "RobotState",
@@ -41,6 +55,7 @@ __all__ = [
     "SceneGraph",
     "Snapshot",
     "Task",
+    "Teach",
     "Transfer",
     "TransferRequest",
     "Vector",

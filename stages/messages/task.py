@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from runner.contract import Message, Struct
+from runner.contract import Command, Message, Struct
 from stages.messages.arrays import Poses
 from stages.messages.scene import Assertion, SceneGraph
 
@@ -104,3 +104,30 @@ class Verdict(Message, frozen=True, kw_only=True):
     """Scenes perceived, plans made and transfers tried on the way to this verdict."""
     plans: int = 0
     transfers: int = 0
+
+
+class Teach(Command, frozen=True, kw_only=True):
+    """Looks, and remembers the scene as the goal of that name."""
+
+    answers = (Goal, Verdict)
+
+    name: str
+    """Letters, digits, - and _."""
+
+
+class Restore(Command, frozen=True, kw_only=True):
+    """Looks, plans and acts until the goal of that name holds or cannot be reached."""
+
+    answers = (Verdict,)
+
+    name: str
+    """Of a goal that was taught."""
+
+
+class Arrange(Command, frozen=True, kw_only=True):
+    """Lays the objects of the simulated world out, as a person would."""
+
+    kind: Literal["goal", "start"]
+    """The scene to be shown, or a disturbed one."""
+    draw: int = 0
+    """Each number draws another scene of that kind."""

@@ -236,13 +236,13 @@ def test_what_breaks_the_type_of_a_command_is_refused(
 
 def test_commands_describe_themselves() -> None:
     add, collect = Calls(load_graph(ACCOUNT), lambda *_: None).types()
-    assert (add.stage, add.name, add.text, add.answer) == ("account", "add", "Adds to the account.", None)
+    assert (add.stage, add.name, add.text, add.answers) == ("account", "add", "Adds to the account.", ())
     assert [(one.name, one.type, one.default, one.text) for one in add.fields] == [
         ("amount", "int", None, "May be negative."),
         ("mood", "glad | sad", "'glad'", ""),
         ("note", "str", "''", ""),
     ]
-    assert collect.answer == "sum"
+    assert collect.answers == ("sum",)
 
 
 def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> None:

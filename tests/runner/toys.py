@@ -183,7 +183,7 @@ class Add(Command, frozen=True, kw_only=True):
 class Collect(Command, frozen=True, kw_only=True):
     """Adds the numbers that come until there are ``count`` of them."""
 
-    answer = Sum
+    answers = (Sum,)
 
     count: int
 

@@ -11,9 +11,11 @@ from stages.messages import (
     Arrangement,
     Goal,
     LookRequest,
+    Restore,
     RobotState,
     SceneGraph,
     Task,
+    Teach,
     Transfer,
     TransferRequest,
     Verdict,
@@ -50,6 +52,10 @@ class Episode:
 
     def ended(self, number: int, item: Transfer, **fields: str) -> list[Message]:
         return self.take(self.stage.on_outcome(outcome(number, item, **fields), self.ctx))
+
+    def called(self, command: Teach | Restore) -> list[Message]:
+        handler = self.stage.on_teach if isinstance(command, Teach) else self.stage.on_restore
+        return self.take(handler(command, self.ctx))  # type: ignore[arg-type]
 
     def until_task(self, goal: SceneGraph = GOAL, start: SceneGraph = START) -> Task:
         """Everything up to the first request for a plan."""
@@ -224,6 +230,45 @@ def test_after_the_verdict_nothing_happens() -> None:
     episode.ended(1, STEP)
     episode.seen(GOAL)
     assert [*episode.arranged(), *episode.seen(START), *episode.planned(STEP), *episode.ended(1, STEP)] == []
+
+
+def test_goals_are_taught_and_restored_by_name() -> None:
+    episode = Episode(scripted=False)
+    assert episode.take(episode.stage.on_start(episode.ctx)) == [Arrangement(kind="goal")]
+    assert episode.arranged() == []
+    for name, shown in (("tea", GOAL), ("mess", START)):
+        assert episode.called(Teach(name=name)) == [LookRequest(purpose=f"goal {name}")]
+        (goal,) = episode.seen(shown)
+        assert isinstance(goal, Goal) and goal.name == name and goal.scene is shown
+    assert episode.called(Restore(name="tea")) == [LookRequest(purpose="restore tea")]
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.goal is GOAL and task.goal_name == "tea"
+    episode.planned(STEP)
+    episode.ended(1, STEP)
+    assert the_verdict(episode.seen(GOAL)).success
+    episode.called(Restore(name="mess"))
+    verdict = the_verdict(episode.seen(START))
+    assert (verdict.goal_name, verdict.success, verdict.transfers) == ("mess", True, 0)
+
+
+def test_a_goal_that_cannot_be_seen_is_a_verdict_and_the_next_command_works() -> None:
+    episode = Episode(scripted=False, n_objects=4, repeats=0)
+    episode.called(Teach(name="tea"))
+    assert the_verdict(episode.seen(GOAL)).failed_stage == "perception"
+    assert episode.called(Teach(name="tea")) == [LookRequest(purpose="goal tea")]
+
+
+def test_commands_at_the_wrong_time_are_refused() -> None:
+    episode = Episode(scripted=False)
+    with pytest.raises(Refused, match=r"name='tea': no such goal; valid: none, teach one first"):
+        episode.called(Restore(name="tea"))
+    with pytest.raises(Refused, match=r"name='../tea': must consist of letters"):
+        episode.called(Teach(name="../tea"))
+    episode.called(Teach(name="tea"))
+    with pytest.raises(Refused, match="busy: waits for a scene graph"):
+        episode.called(Teach(name="tea"))
+    with pytest.raises(Refused, match="busy: waits for the person's arrangement"):
+        Episode().called(Teach(name="tea"))
 
 
 @pytest.mark.parametrize(
