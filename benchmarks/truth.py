@@ -35,7 +35,7 @@ _STEPS, _GATE = 20, 0.01
 _FORM = CostForm()
 HEADING = (
     "| scene | object | estimate off by, degrees | readings off the estimate | readings off the truth "
-    "| ICP turns the truth, degrees |\n|---|---|---|---|---|---|"
+    "| ICP turns the truth, degrees | the truth leans, degrees |\n|---|---|---|---|---|---|---|"
 )
 
 
@@ -49,6 +49,8 @@ class Comparison:
     at_estimate: float
     turned: float
     """Radians by which polish turns the object from the truth, modulo symmetries."""
+    leans: float
+    """Radians between the plane's normal and the axis of the true object that is nearest to it."""
 
 
 def comparisons(image: Image, scores: Sequence[Score], catalogue: Catalogue, dof: Dof) -> Iterator[Comparison]:
@@ -70,7 +72,7 @@ def comparisons(image: Image, scores: Sequence[Score], catalogue: Catalogue, dof
             directions = Proposals(item, dof).directions(scene.T_camera_table)
             moved = _polished(shape, truth, directions, scene, others)
             turned = pose_errors(moved, truth, nearest_symmetries(moved, truth, item.symmetries))[1]
-            yield Comparison(one, at_truth, at_estimate, turned)
+            yield Comparison(one, at_truth, at_estimate, turned, _lean(truth, scene.T_camera_table))
 
 
 def _polished(shape: Shape, T: Floats, directions: Floats, scene: ObservedScene, others: Float32s) -> Floats:
@@ -82,11 +84,17 @@ def _polished(shape: Shape, T: Floats, directions: Floats, scene: ObservedScene,
     return pose(moved[:, :3], moved[:, 3])
 
 
+def _lean(T_camera_object: Floats, T_camera_table: Floats) -> float:
+    cosines = np.abs((T_camera_object[:3, :3] * T_camera_table[:3, 2][:, None]).sum(0))
+    return float(np.arccos(min(1.0, cosines.max())))
+
+
 def line(each: Comparison, name: str) -> str:
     """A row of the table."""
     one = each.score
-    cells = [str(one.truth.image[0]), name, f"{np.rad2deg(one.radians):.2f}", f"{1000 * each.at_estimate:.2f} mm",
-             f"{1000 * each.at_truth:.2f} mm", f"{np.rad2deg(each.turned):.2f}"]  # fmt: skip
+    degrees = [f"{np.rad2deg(angle):.2f}" for angle in (one.radians, each.turned, each.leans)]
+    off = [f"{1000 * distance:.2f} mm" for distance in (each.at_estimate, each.at_truth)]
+    cells = [str(one.truth.image[0]), name, degrees[0], *off, *degrees[1:]]
     return f"| {' | '.join(cells)} |"
 
 
