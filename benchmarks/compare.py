@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.command import command as refusing
 from benchmarks.datasets import detections_file, images, parse_wanted
 from benchmarks.figures import Scored, behind, draw, markdown
-from runner.children import SINGLE_THREADED
+from runner.children import ENVIRONMENT
 from runner.contract import Refused
 
 TITLES = {
@@ -93,7 +93,7 @@ def _compare(methods: Sequence[str], options: argparse.Namespace) -> int:
 def _run(method: str, options: argparse.Namespace, out: Path) -> bool:
     print(f"{TITLES[method]} ...", file=sys.stderr, flush=True)
     done = subprocess.run(
-        command(method, options, out), env={**os.environ, **SINGLE_THREADED}, stdout=subprocess.DEVNULL, check=False
+        command(method, options, out), env={**os.environ, **ENVIRONMENT}, stdout=subprocess.DEVNULL, check=False
     )
     if done.returncode:
         print(f"{TITLES[method]} failed with exit code {done.returncode}", file=sys.stderr)

@@ -15,7 +15,7 @@ from benchmarks.accuracy import failures, right_sets, score, table
 from benchmarks.command import command
 from benchmarks.datasets import Image, ImageId, detections_file, images, parse_wanted
 from benchmarks.pipeline import Done, Estimate, Pipeline, Step, Steps
-from runner.children import SINGLE_THREADED
+from runner.children import ENVIRONMENT
 from runner.contract import Refused
 from runner.graph import Graph, graph_from_json, graph_to_json, load_graph
 from stages.devices.bop_results import HEADER, Result
@@ -100,7 +100,7 @@ class _Workers:
 
     def __init__(self, graph: Graph, count: int, *, whole: bool) -> None:
         # Numba reads its number of threads when it is imported, so a process must be born with it.
-        os.environ |= dict(SINGLE_THREADED)
+        os.environ |= dict(ENVIRONMENT)
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(graph_to_json(graph), whole))
         # Every process sets up before the first image, so that none pays for another's compilation.

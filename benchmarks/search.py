@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.command import command
 from benchmarks.datasets import Image, detections_file, images
-from runner.children import SINGLE_THREADED
+from runner.children import ENVIRONMENT
 from stages.perception.combinations import cheapest, ordered
 from stages.perception.composition import FirstLook
 from stages.perception.likelihood import ObservedScene
@@ -118,7 +118,7 @@ def _search(
 
 def outcome(task: Search) -> Outcome:
     """The same in a process of its own, so that its peak of memory is its own."""
-    os.environ |= dict(SINGLE_THREADED)
+    os.environ |= dict(ENVIRONMENT)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(search, task).result()
 

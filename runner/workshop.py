@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
-from runner.children import SINGLE_THREADED, die_with_parent, ending, last_lines
+from runner.children import ENVIRONMENT, die_with_parent, ending, last_lines
 
 T = TypeVar("T")
 
@@ -28,7 +28,7 @@ def clean_command(module: str, *arguments: str) -> tuple[list[str], dict[str, st
     paths = os.pathsep.join(path for path in sys.path if path)
     return [sys.executable, "-m", module, *arguments], {
         **os.environ,
-        **SINGLE_THREADED,
+        **ENVIRONMENT,
         "PYTHONUNBUFFERED": "1",
         "PYTHONPATH": paths,
     }
@@ -36,7 +36,7 @@ def clean_command(module: str, *arguments: str) -> tuple[list[str], dict[str, st
 
 def is_clean() -> bool:
     """True in an interpreter that was started as :func:`clean_command` says."""
-    return all(os.environ.get(name) == value for name, value in SINGLE_THREADED.items())
+    return all(os.environ.get(name) == value for name, value in ENVIRONMENT.items())
 
 
 class Forked:
