@@ -15,6 +15,7 @@ from mcap.records import Channel, Metadata, Schema
 from runner.codec import CodecError, Envelope, LogLine, Step, unpack
 from runner.container import Container, Damage, Entry, open_file
 from runner.contract import Refused
+from runner.migrations import migrated
 from runner.provenance import fingerprint
 
 T = TypeVar("T")
@@ -225,7 +226,7 @@ class Recording:
             yield from (record for record in container if isinstance(record, Metadata) or _readable(record))
 
     def envelope(self, id: str) -> Envelope:
-        """One message by id; raises KeyError where it is not recorded."""
+        """One message by id, as its class is today; raises KeyError where it is not recorded."""
         offset = self.messages[id].offset
         if offset not in self._open:
             self._open[offset] = self._envelopes_at(offset)
@@ -269,7 +270,7 @@ class Recording:
         for entry in entries:
             if not entry.topic.startswith((JOURNAL, LOG)):
                 with contextlib.suppress(CodecError):  # noted as damage when the file was read
-                    sealed = unpack(Envelope, entry.data)
+                    sealed = migrated(unpack(Envelope, entry.data))
                     envelopes.setdefault(sealed.id, sealed)
         return envelopes
 

@@ -1,0 +1,81 @@
+"""Old recordings stay alive: a real one of the first runner, whose messages have changed since."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from runner.codec import CodecError, Envelope, decode_untyped, open_envelope
+from runner.migrations import Migration, migrated, without_gained_fields
+from runner.recording import Recording
+from runner.replay import verify
+from tests.runner.recordings import rewrite
+from tests.runner.weather import Forecast, Reading
+
+OLD = Path(__file__).with_name("weather-1.mcap")
+
+
+def replay(path: Path) -> tuple[int, str]:
+    lines: list[str] = []
+    return verify(path, (), workers=1, say=lines.append), "\n".join(lines)
+
+
+def test_an_old_recording_is_read_as_messages_are_today():
+    recording = Recording(OLD)
+    assert recording.verdict.complete
+    reading = open_envelope(Reading, recording.envelope("thermometer.reading#1"))
+    assert (reading.humidity, reading.place.station, reading.place.height) == (0.5, "roof 1", 0.0)
+    assert len(reading.temperature) == 4
+    assert open_envelope(Forecast, recording.envelope("forecaster.forecast#11")).spread == 0.0
+
+
+def test_an_old_recording_replays():
+    code, said = replay(OLD)
+    assert code == 0, said
+    assert "12" in said
+
+
+def test_a_changed_value_in_an_old_recording_still_diverges(tmp_path: Path):
+    mean = Recording(OLD).envelope("forecaster.forecast#3").body
+    value = msgspec.msgpack.decode(mean)["celsius"][2][:8]
+    path = rewrite(OLD, tmp_path / "changed.mcap", lambda _, data: data.replace(value, value[:7] + b"\x41"))
+    code, said = replay(path)
+    assert code == 1
+    assert "forecaster.forecast#3" in said
+    assert "celsius[0]" in said
+
+
+def test_a_version_without_a_way_to_today_is_refused():
+    sealed = Recording(OLD).envelope("thermometer.reading#0")
+    with pytest.raises(CodecError, match="Reading 3"):
+        open_envelope(Reading, msgspec.structs.replace(sealed, version=4))
+
+
+def envelope(kind: str, version: int, **fields: object) -> Envelope:
+    body = msgspec.Raw(msgspec.msgpack.encode(fields))
+    return Envelope("a.b#0", "a.b#0", 0, kind, version, (), body)
+
+
+def test_fields_are_renamed_retired_and_changed_in_lists_and_structs_too():
+    migration = Migration(
+        renamed={"things.pose": "T"}, retired=("colour", "things.age"), change=lambda fields: {**fields, "count": 2}
+    )
+    things = [{"pose": 1, "age": 7}, {"pose": 2, "age": 8}]
+    assert migration.apply({"colour": "red", "things": things, "n": 1}) == {
+        "things": [{"T": 1}, {"T": 2}],
+        "n": 1,
+        "count": 2,
+    }
+
+
+def test_what_nothing_became_of_keeps_its_bytes():
+    sealed = envelope("Something", 1, x=1)
+    assert migrated(sealed) is sealed
+
+
+def test_gained_fields_are_not_compared_and_lost_ones_are():
+    old = envelope("A", 1, x=1, inner=[{"y": 2}])
+    new = without_gained_fields(old, envelope("A", 1, z=0, inner=[{"y": 2, "w": 5}], x=1))
+    assert bytes(new.body) == bytes(old.body)
+    lost = without_gained_fields(old, envelope("A", 1, x=1, inner=[{}]))
+    assert decode_untyped(lost.body) == {"x": 1, "inner": [{}]}
