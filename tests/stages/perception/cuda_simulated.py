@@ -323,24 +323,21 @@ def test_flips_spins_renewal_and_elitism() -> None:
     assert abs(centres[:, None] - before[None]).max(-1).min(1) == pytest.approx(0, abs=1e-5)
 
 
-@given(turn=st.tuples(*[st.floats(-0.15, 0.15)] * 3), shift=st.tuples(*[st.floats(-0.01, 0.01)] * 3), yaw=st.booleans())
-@settings(max_examples=6, deadline=None)
-def test_polish_is_the_cpus(turn: tuple[float, ...], shift: tuple[float, ...], yaw: bool) -> None:
-    seen = holding(BOX)
+@pytest.mark.parametrize("dof", [3, 6])
+def test_polish_is_the_cpus(dof: Dof) -> None:
+    seen, rng = holding(BOX), np.random.default_rng(dof)
     cpu = likelihood(BOX, seen, CostForm(), (0, 0, WIDTH, HEIGHT))
-    begin = standing(turn=(0.3 + turn[0], 0.4 + turn[1], 0.5 + turn[2]))
-    begin[:, 3] += shift
-    outside = standing(x=3.0)
-    poses, directions = (
-        np.stack([begin, outside]),
-        Proposals(CATALOGUE["cereal_box"], 3 if yaw else 6).directions(camera()),
-    )
+    turns = np.array([0.3, 0.4, 0.5]) + rng.uniform(-0.15, 0.15, (4, 3))
+    poses = np.stack([*(standing(turn=tuple(turn)) for turn in turns), standing(x=3.0)])
+    poses[:4, :, 3] += rng.uniform(-0.01, 0.01, (4, 3))
+    directions = Proposals(CATALOGUE["cereal_box"], dof).directions(camera())
     expected = cpu.refine(poses, directions, steps=2, gate=0.03)
+    assert (abs(expected - poses).max((1, 2))[:4] > 1e-3).all()
+    # The last is out of the picture and has nothing to go by.
+    assert expected[4] == pytest.approx(poses[4])
     for launch in (TINY, Launch(threads=4, z_buffer_bytes=4)):
         found = Batch([cpu.shape], [look(cpu, seen)], launch).refined(poses, directions, steps=2, gate=0.03)
-        # Both take the same pixels but for those within rounding of an edge.
-        assert found == pytest.approx(expected, abs=2e-3)
-    assert expected[1] == pytest.approx(outside)
+        assert found == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_first_particles_are_polished() -> None:
@@ -350,7 +347,7 @@ def test_the_first_particles_are_polished() -> None:
     following = evolved(cpu, poses, step(6, polished=2))
     moved = cpu.refine(poses[:1], np.eye(6), steps=2, gate=0.03)[0]
     assert abs(moved - poses[0]).max() > 2e-3
-    assert following[:2] == pytest.approx(np.stack([moved, moved]), abs=2e-3)
+    assert following[:2] == pytest.approx(np.stack([moved, moved]), abs=1e-5)
     assert following[2:] == pytest.approx(poses[2:], abs=1e-6)
 
 
@@ -403,14 +400,14 @@ def test_whole_filters_land_where_the_cpus_do() -> None:
     In one batch with another population it ends with the bytes that it has alone.
     """
     box = replace(CATALOGUE["cereal_box"], mesh=BOX)
-    chosen = FilterSettings(particles=26, fine_particles=8, overdraw=3, schedule=8, patience=2, coarse_pixels=10.0,
-                            fine_pixels=14.0, flips=0.1, polished=0.1, dof=3)  # fmt: skip
+    chosen = FilterSettings(particles=26, fine_particles=8, overdraw=2, schedule=6, patience=2, coarse_pixels=7.0,
+                            fine_pixels=10.0, flips=0.1, polished=0.1, dof=3)  # fmt: skip
     seen = holding(BOX, (camera() @ upright("cereal_box", 0.0, 0.02, 0.5))[:3])
 
     def tracks(device: str, *seeds: int) -> list[Track]:
         owner = ObjectFilter(box, replace(chosen, device=chosen_device(device, place="device")))
         tasks = [Task(owner, seen.plane_inverse, (4, 2, 19, 15), np.random.default_rng(seed)) for seed in seeds]
-        return run_together(seen, tasks, iterations=8)
+        return run_together(seen, tasks, iterations=6)
 
     (cpu,), (gpu,), (again, other) = tracks("cpu", 3), tracks("cuda", 3), tracks("cuda", 3, 4)
     for track in (gpu, other):
