@@ -131,15 +131,19 @@ def behind(methods: Mapping[str, Sequence[Score]]) -> str:
     """Where another method has more objects than the first: at each position bound, of the whole degrees."""
     name, *others = methods
     lines = [
-        f"{other} is ahead of {name} within {100 * metres:.0f} cm and {degrees} degrees: {theirs} objects against {own}"
-        for metres in POSITION_BOUNDS
-        for degrees in range(1, 181)
-        for own in [sum(one.within(metres, degrees) for one in methods[name])]
+        f"{other} is ahead of {name} within {degrees} degrees (objects): {', '.join(filter(None, found))}"
         for other in others
-        for theirs in [sum(one.within(metres, degrees) for one in methods[other])]
-        if theirs > own
+        for degrees in range(1, 181)
+        for found in [[_lead(methods[other], methods[name], metres, degrees) for metres in POSITION_BOUNDS]]
+        if any(found)
     ]
     return "\n".join(lines) or f"No method is ahead of {name} at any bound of the figure (each whole degree)."
+
+
+def _lead(theirs: Sequence[Score], ours: Sequence[Score], metres: float, degrees: float) -> str:
+    """Both counts where the other method has more objects, otherwise nothing."""
+    other, own = (sum(one.within(metres, degrees) for one in scores) for scores in (theirs, ours))
+    return f"{other} against {own} within {100 * metres:.0f} cm" if other > own else ""
 
 
 def _share(hits: int, count: int) -> str:

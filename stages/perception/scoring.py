@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from stages.messages.scene import SceneObject
-from stages.perception.metrics import pose_errors
+from stages.perception.metrics import nearest_symmetries, pose_errors
 from stages.scene.catalogue import Catalogue, Floats
 
 
@@ -53,7 +53,7 @@ def _label(name: str, catalogue: Catalogue) -> str:
 
 
 def _error(name: str, T_base_object: Floats, perceived: SceneObject, catalogue: Catalogue) -> ObjectError:
-    symmetries = catalogue[perceived.label].symmetries.transforms()
+    symmetries = nearest_symmetries(perceived.T_base_object, T_base_object, catalogue[perceived.label].symmetries)
     position, rotation = pose_errors(perceived.T_base_object, T_base_object, symmetries)
     return ObjectError(name, found=True, position=position, rotation=rotation)
 
