@@ -70,7 +70,7 @@ _STANDING = ("mug", "cup", "soup_can", "tuna_can", "sauce_bottle", "water_bottle
              "milk_carton", "salt_shaker")  # fmt: skip
 """Objects that look nearly the same when they are turned or flipped."""
 KINDS = {
-    "clutter": Kind(Pile(), exact=20, noisy=10),
+    "clutter": Kind(Pile(), exact=20, noisy=30),
     "coarse": Kind(
         Pile(
             counts=(6, 7, 5, 8, 6), spread=0.035, least_visible=0.04, distance=(1.1, 1.7), sensor=_COARSE,
@@ -206,10 +206,11 @@ def _hypothesised(estimate: Estimate) -> list[list[str]]:
     return [sorted(candidate.label for candidate in item.candidates) for item in found]
 
 
-def scenes(folder: Path, name: str, most: int | None, processes: int) -> list[Scene]:
+def scenes(folder: Path, name: str, most: int | None, processes: int, *, kept: bool = False) -> list[Scene]:
     """The estimated scenes of one set; rendered and estimated once and then read from ``folder``.
 
-    ``most`` is the number of scenes of each kind of piles and boxes that are used at most.
+    ``most`` is the number of scenes of each kind of piles and boxes that are used at most; with ``kept`` only those
+    are used that were estimated before.
     """
     found: list[Scene] = []
     for number, (kind, setting) in enumerate(KINDS.items()):
@@ -219,7 +220,7 @@ def scenes(folder: Path, name: str, most: int | None, processes: int) -> list[Sc
             path = folder / f"{dataset.name}-{boxes}.jsonl"
             lines = path.read_text().splitlines() if path.is_file() else []
             done = [msgspec.json.decode(line, type=Scene) for line in lines]
-            if len(done) < wanted:
+            if len(done) < wanted and not kept:
                 generate(dataset, setting.pile, max(setting.exact, setting.noisy), _SEEDS[name] + number)
                 done += _estimated(path, (kind, boxes), range(len(done), wanted), processes)
             found += done[:wanted]
@@ -355,7 +356,7 @@ def wilson(right: int, count: int) -> tuple[float, float]:
     return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 
-def reliability(sure: Floats, right: Floats, edges: Sequence[float] = _BINS) -> list[Bin]:
+def reliability(sure: Floats, right: Truths, edges: Sequence[float] = _BINS) -> list[Bin]:
     """Bins that hold something."""
     found: list[Bin] = []
     for low, high in pairwise(edges):
@@ -450,7 +451,7 @@ def plot(test: Bins, both: Bins, path: Path) -> None:
         each.axvspan(0.85, 0.95, color="0.93", zorder=0)
         _draw(each, alone, "#2c6fbb", "test set, 95 %", -0.004)
         _draw(each, pooled, "#c7761d", "both sets, constants of the other", 0.004)
-        each.set(xlabel="probability that was reported", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
+        each.set(xlabel="probability that was reported", xlim=(0, 1.06), ylim=(0, 1.06), title=title)
     axes[0, 0].set(ylabel="share that is right")
     axes[0, 0].legend(loc="upper left", frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -493,12 +494,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where scenes and estimates are kept; empty it to begin anew")
     parser.add_argument("--most", type=int, help="scenes of each kind of piles and boxes, at most")
+    parser.add_argument("--kept", action="store_true", help="use the scenes that are estimated already and no others")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--evaluate", action="store_true", help="keep the constants that are there")
     options = parser.parse_args()
-    sets = {name: scenes(options.folder, name, options.most, options.processes) for name in _SEEDS}
+    sets = {name: scenes(options.folder, name, options.most, options.processes, kept=options.kept) for name in _SEEDS}
     if not options.evaluate:
-        command = "python -m benchmarks.calibration FOLDER" + (f" --most {options.most}" if options.most else "")
+        most, kept = f" --most {options.most}" if options.most else "", " --kept" if options.kept else ""
+        command = f"python -m benchmarks.calibration FOLDER{most}{kept}"
         write_constants(fit(sets["train"]), CONSTANTS, command)
         Calibration.load.cache_clear()
     constants = Calibration.load()

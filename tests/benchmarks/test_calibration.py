@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from benchmarks.calibration import (
     fit,
     plot,
     reliability,
+    scenes,
     wilson,
     write_constants,
 )
@@ -34,7 +36,7 @@ PLAIN = Evidence(
 def synthetic(count: int, seed: int) -> list[Scene]:
     """Scenes whose poses are right with a probability that margin and spread decide."""
     rng = np.random.default_rng(seed)
-    scenes: list[Scene] = []
+    found: list[Scene] = []
     for _ in range(count):
         margin, spread = float(rng.uniform(-2, 8)), float(rng.uniform(0.001, 0.02))
         evidence = replace(PLAIN, margin=margin, spread_metres=spread, breadth=spread / RIGHT_METRES)
@@ -45,8 +47,8 @@ def synthetic(count: int, seed: int) -> list[Scene]:
         # The second hypothesis is true as often as a scale of 0.2 says it is.
         deficit = float(rng.uniform(0, 1))
         true = int(rng.random() < 1 / (1 + np.exp(deficit / 0.2)))
-        scenes.append(Scene("low", "noisy", 0, true == 0, true, 10.0, (-5.0, -5.0 - 10.0 * deficit), (instance,)))
-    return scenes
+        found.append(Scene("low", "noisy", 0, true == 0, true, 10.0, (-5.0, -5.0 - 10.0 * deficit), (instance,)))
+    return found
 
 
 def test_wilson_interval() -> None:
@@ -117,6 +119,14 @@ def test_a_true_set_that_is_not_among_the_hypotheses_makes_the_winner_less_sure(
     lost = [replace(scene, winner_right=False, true_hypothesis=-1) if i % 4 == 0 else scene
             for i, scene in enumerate(scenes)]  # fmt: skip
     assert fit(lost).hypothesis_scale > 1.1 * fit(scenes).hypothesis_scale
+
+
+def test_scenes_that_were_estimated_are_kept(tmp_path: Path) -> None:
+    lines = [msgspec.json.encode(scene).decode() for scene in synthetic(3, 9)]
+    (tmp_path / "test-low-noisy.jsonl").write_text("\n".join(lines) + "\n")
+    assert scenes(tmp_path, "test", None, 1, kept=True) == synthetic(3, 9)
+    assert scenes(tmp_path, "test", 2, 1, kept=True) == synthetic(3, 9)[:2]
+    assert scenes(tmp_path, "train", None, 1, kept=True) == []
 
 
 def test_every_kind_of_piles_holds_more_doubt_than_clutter_15() -> None:
