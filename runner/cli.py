@@ -5,7 +5,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from runner.commands import Command, graphs, inspect, keys, live, recordings, replay
+from runner.commands import Command, graphs, inspect, keys, live, machine, recordings, replay
+from runner.completion import complete_and_exit
 from runner.contract import Refused
 
 EXIT_REFUSED = 2
@@ -13,7 +14,9 @@ EXIT_REFUSED = 2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status; what is refused is one line on stderr."""
-    options = parser().parse_args(arguments)
+    built = parser()
+    complete_and_exit(built)
+    options = built.parse_args(arguments)
     options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     sys.path.insert(0, os.getcwd())  # noqa: PTH109 - as `python -m` does: stages beside the graph can be named
     command: Command = options.command
@@ -30,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (graphs, live, recordings, inspect, replay, keys):
+    for group in (graphs, live, recordings, inspect, replay, keys, machine):
         group.add_commands(commands)
     return parser
 

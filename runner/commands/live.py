@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from runner import completion
 from runner.commands import Commands, add
+from runner.completion import completed
 from runner.contract import Refused
 
 
@@ -15,25 +17,29 @@ def add_commands(commands: Commands) -> None:
     _add_logs(commands)
     _add_topic(commands)
     call = add(commands, "call", _call, "have a stage do what it can be asked, and wait until it is done")
-    call.add_argument("stage", metavar="STAGE", nargs="?", help="without a command: lists what it can be asked")
-    call.add_argument("name", metavar="COMMAND", nargs="?")
-    call.add_argument("fields", metavar="FIELD=VALUE", nargs="*", help="for example name=breakfast")
+    stage = call.add_argument("stage", metavar="STAGE", nargs="?", help="without a command: lists what it can be asked")
+    completed(stage, completion.callable_stages)
+    completed(call.add_argument("name", metavar="COMMAND", nargs="?"), completion.command_names)
+    fields = call.add_argument("fields", metavar="FIELD=VALUE", nargs="*", help="for example name=breakfast")
+    completed(fields, completion.fields)
     _add_run(call)
     restart = add(commands, "restart", _restart, "replace a process in order: it finishes its step, nothing is lost")
-    restart.add_argument("process", metavar="STAGE[.REPLICA]")
+    completed(restart.add_argument("process", metavar="STAGE[.REPLICA]"), completion.processes)
     _add_run(restart)
     _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--run", metavar="NAME", help="which run, where several live; the beginning of its name will do"
-    )
+    text = "which run, where several live; the beginning of its name will do"
+    completed(parser.add_argument("--run", metavar="NAME", help=text), completion.run_names)
 
 
 def _add_logs(commands: Commands) -> None:
     logs = add(commands, "logs", _logs, "show what the stages of the running graph say, or of the last one")
-    logs.add_argument("stage", metavar="STAGE", nargs="?", help="only this one, with what its processes printed")
+    stage = logs.add_argument(
+        "stage", metavar="STAGE", nargs="?", help="only this one, with what its processes printed"
+    )
+    completed(stage, completion.stages)
     logs.add_argument("-f", "--follow", action="store_true", help="go on until the graph ends")
     logs.add_argument(
         "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where the last run is"
@@ -46,12 +52,12 @@ def _add_topic(commands: Commands) -> None:
     verbs = topic.add_subparsers(required=True, metavar="VERB")
     _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
     echo = add(verbs, "echo", _topic_echo, "print messages as they come, whatever their type")
-    echo.add_argument("topic", metavar="STAGE/PORT")
+    completed(echo.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
     echo.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many messages")
     _add_run(echo)
     for name, text in (("hz", "how often messages come"), ("bw", "how many bytes flow")):
         measure = add(verbs, name, _topic_rate, f"{text}, from their headers alone")
-        measure.add_argument("topic", metavar="STAGE/PORT")
+        completed(measure.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
         measure.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many lines, one a second")
         measure.set_defaults(measure=name)
         _add_run(measure)

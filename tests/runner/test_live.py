@@ -7,9 +7,11 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -18,7 +20,9 @@ import pytest
 from runner.bus import Bus, free_endpoint
 from runner.calls import CallRequest, Calls, Progress
 from runner.codec import Envelope, open_envelope, pack, unpack
+from runner.completion import Shell, script
 from runner.contract import Refused
+from runner.doctor import examine, examine_graph
 from runner.echo import lines_of
 from runner.graph import load_graph
 from runner.live import Live
@@ -47,36 +51,40 @@ class Run:
             raise
         self.entry = next(entry for entry in runs() if Path(entry.recording).parent == folder)
 
+    def pid_of(self, stage: str) -> int:
+        with Live(self.entry) as live:
+            return next(process.pid for process in live.status().processes if process.stage == stage)
+
     def finish(self) -> Finished:
         return finish(self.process, self.folder, self.printed)
 
     def close(self) -> None:
-        self.process.terminate()
-        self.finish()
+        if self.process.stdout is not None and not self.process.stdout.closed:
+            self.process.terminate()
+            self.finish()
 
 
 def sink(folder: Path) -> str:
     return f"sink.path={folder / 'out.txt'}"
 
 
-@pytest.fixture(autouse=True)
-def registry(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lists of runs of their own: other graphs may run on this machine."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
+@pytest.fixture(scope="module", autouse=True)
+def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A list of runs of its own: other graphs may run on this machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
+        yield
 
 
 @pytest.fixture
-def doubles(tmp_path: Path) -> Iterator[Run]:
-    """A counter, a doubler and a sink without an end."""
-    running = Run(tmp_path, DOUBLES, sink(tmp_path), *ENDLESS)
-    yield running
-    running.close()
+def nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
-@pytest.fixture
-def account(tmp_path: Path) -> Iterator[Run]:
-    """A stage with commands."""
-    running = Run(tmp_path, ACCOUNT)
+@pytest.fixture(scope="module")
+def account(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    """A stage with commands; the last test of this file ends it."""
+    running = Run(tmp_path_factory.mktemp("account"), ACCOUNT)
     yield running
     running.close()
 
@@ -128,6 +136,7 @@ def entry(run: str) -> Entry:
     return Entry(run, "tcp/127.0.0.1:1", 1, "graph.yaml", f"recordings/{run}.mcap", time.time())
 
 
+@pytest.mark.usefixtures("nothing_runs")
 def test_a_run_is_listed_as_long_as_its_process_lives() -> None:
     one, two = Registration(entry("one-1")), Registration(entry("two-1"))
     assert [found.run for found in runs()] == ["one-1", "two-1"]
@@ -152,26 +161,27 @@ def test_a_folder_that_others_may_enter_is_refused(tmp_path: Path, monkeypatch: 
         runs()
 
 
-def test_a_supervisor_that_was_killed_is_struck_off_the_list(doubles: Run) -> None:
-    assert [found.run for found in runs()] == [doubles.entry.run]
-    doubles.process.kill()
-    doubles.process.communicate()
-    wait_for(lambda: not runs())
+def test_a_supervisor_that_was_killed_is_struck_off_the_list(tmp_path: Path) -> None:
+    run = Run(tmp_path, ACCOUNT)
+    assert run.entry in runs()
+    run.process.kill()
+    run.process.communicate()
+    wait_for(lambda: run.entry not in runs())
 
 
 # ------------------------------------------------------------------------------------------ status
 
 
-def test_a_run_says_how_its_processes_are(doubles: Run) -> None:
-    with Live(doubles.entry) as live:
+def test_a_run_says_how_its_processes_are(account: Run) -> None:
+    with Live(account.entry) as live:
         live.wait_until_ready()
-        wait_for(lambda: all(process.pulse and process.pulse.sent for process in live.status().processes[1:3]))
+        wait_for(lambda: all(process.pulse and process.sent for process in live.status().processes[1:]))
         status = live.status()
-    assert [process.name for process in status.processes] == ["recorder", "counter", "doubler", "sink"]
+    assert [process.name for process in status.processes] == ["recorder", "counter", "account"]
     assert {process.state for process in status.processes} <= {"waiting", "working", "held back"}
-    assert status.recording == doubles.entry.recording
-    double = next(topic for topic in status.topics if topic.topic == "doubler/double")
-    assert (double.type, double.consumers) == ("Double", ("sink.double",))
+    assert status.recording == account.entry.recording
+    number = next(topic for topic in status.topics if topic.topic == "counter/number")
+    assert (number.type, number.consumers) == ("Number", ("account.number",))
 
 
 # ------------------------------------------------------------------------------------------ commands
@@ -187,20 +197,15 @@ def call(live: Live, command: str, **arguments: str) -> Progress:
 def test_a_stage_does_what_is_called(account: Run) -> None:
     with Live(account.entry) as live:
         assert call(live, "add", amount="5", note="from me").lines == (("info", "5 added from me"),)
-        added = call(live, "add", amount="-2")
-        assert added.emitted == ("account.sum#1",)
+        (emitted,) = call(live, "add", amount="-2").emitted
+        assert emitted.startswith("account.sum#")
         assert call(live, "add", amount="0").refused == "amount=0: nothing to add; valid: any other number"
-        collected = call(live, "collect", count="3")
-        answer = open_envelope(Sum, unpack(Envelope, collected.answer))
-        assert (answer.total, answer.calls) == (6, 2)
-        live.down()
-    finished = account.finish()
-    assert finished.code == 0, finished.output
-    recording = Recording(finished.recording)
-    assert recording.verdict.complete
-    assert recording.envelope("supervisor.account_add#1").type == "Add"
-    replayed = runner("replay", str(finished.recording), "--verify")
-    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+        before = sum_of(call(live, "collect", count="1"))
+        assert sum_of(call(live, "collect", count="3")) == before + 3
+
+
+def sum_of(progress: Progress) -> int:
+    return open_envelope(Sum, unpack(Envelope, progress.answer)).total
 
 
 @pytest.mark.parametrize(
@@ -247,8 +252,7 @@ def test_commands_describe_themselves() -> None:
 
 def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> None:
     with Live(account.entry) as live:
-        pid = next(process.pid for process in live.status().processes if process.stage == "account")
-        os.kill(pid, signal.SIGKILL)
+        os.kill(account.pid_of("account"), signal.SIGKILL)
         assert call(live, "add", amount="5").lines == (("info", "5 added"),)
 
 
@@ -301,7 +305,8 @@ def test_ps_and_topic_list_show_what_runs(account: Run) -> None:
     ]
     assert [line.split()[0] for line in lines[2:]] == ["recorder", "counter", "account"]
     topics = {line.split()[0]: line.split()[1:] for line in runner("topic", "list").stdout.splitlines()}
-    assert topics["supervisor/account_add"] == ["Add", "1", "0.0", "0", "B", "account.add"]
+    assert topics["supervisor/account_add"][0] == "Add"
+    assert int(topics["supervisor/account_add"][1]) > 0
     assert topics["account/sum"][-1] == "nobody"
 
 
@@ -334,26 +339,6 @@ def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
     tool.communicate()
 
 
-def test_log_lines_of_a_run_and_of_the_last_one(account: Run) -> None:
-    assert runner("call", "account", "add", "amount=2").stdout.splitlines()[0].endswith("account          2 added")
-    wait_for(lambda: "2 added" in runner("logs", "account").stdout)
-    follower = subprocess.Popen(
-        [sys.executable, "-m", "runner.cli", "logs", "-f"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    assert read_until(follower, "2 added")
-    assert runner("call", "account", "add", "amount=0").returncode == 2
-    assert read_until(follower, "nothing to add")
-    assert runner("down").stdout.startswith(f"{account.entry.run} has ended")
-    assert not runs()
-    assert follower.wait(30) == 0
-    follower.communicate()
-    last = runner("logs", "--recordings", str(account.folder)).stdout
-    assert "2 added" in last
-    assert "nothing to add" in last
-    refused = runner("logs", "acount", "--recordings", str(account.folder))
-    assert "nothing from a stage 'acount'; did you mean 'account'" in refused.stderr
-
-
 def test_two_graphs_never_meet(account: Run, tmp_path: Path) -> None:
     other = Run(tmp_path / "other", ACCOUNT, "counter.count=0")
     try:
@@ -370,7 +355,7 @@ def test_two_graphs_never_meet(account: Run, tmp_path: Path) -> None:
         assert silent.stdout.splitlines() == ["no messages", "no messages"]
         assert runner("call", "account", "add", "amount=2", "--run", other.entry.run).returncode == 0
         with Live(account.entry) as live:
-            assert call(live, "add", amount="40").emitted == ("account.sum#0",)
+            assert call(live, "add", amount="40").lines == (("info", "40 added"),)
         assert runner("down", "--run", other.entry.run).returncode == 0
         assert [found.run for found in runs()] == [account.entry.run]
     finally:
@@ -411,3 +396,85 @@ def test_any_message_becomes_text() -> None:
     ]
     assert lines[-4:] == ["    ... and 8 more", "  text: |", "      one", "      two"]
     assert next(lines_of(b"\xc1garbage")).startswith("unreadable, 8 B: ")
+
+
+# ------------------------------------------------------------------------------------------ doctor, completion
+
+
+def test_the_doctor_finds_this_machine_fit_and_a_bad_graph() -> None:
+    found = list(examine(HERE))
+    assert {finding.subject for finding in found} >= {
+        "python",
+        "packages",
+        "shared memory",
+        "zenoh",
+        "recordings",
+        "limits",
+    }
+    assert [finding for finding in found if finding.judgement == "bad" and finding.subject != "EGL"] == []
+    assert next(examine_graph(ACCOUNT)).judgement == "good"
+    (bad,) = examine_graph(HERE / "absent.yaml")
+    assert (bad.judgement, "absent.yaml" in bad.text) == ("bad", True)
+
+
+def test_the_doctor_says_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runner.doctor.LEAST_DISK", 10**18)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+    found = {finding.subject: finding for finding in examine(tmp_path)}
+    assert found["recordings"].remedy.startswith("remove old recordings")
+    assert found["runs"].judgement == "bad"
+    assert list(found["recordings"].lines())[1].strip() == f"-> {found['recordings'].remedy}"
+
+
+def completions(line: str) -> set[str]:
+    """What the shell is told where Tab is pressed at the end of a line."""
+    with tempfile.NamedTemporaryFile() as answer:
+        asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": answer.name, "_ARGCOMPLETE_IFS": "\n"}
+        place = {"COMP_LINE": line, "COMP_POINT": str(len(line))}
+        command = [sys.executable, "-m", "runner.cli"]
+        subprocess.run(command, env={**os.environ, **asked, **place}, timeout=60, check=False)
+        return {found.strip() for found in answer.read().decode().split("\n")}
+
+
+def test_shells_complete_commands_and_what_runs(account: Run) -> None:
+    assert {"ps", "topic", "doctor"} <= completions("runner ")
+    assert completions("runner topic echo cou") == {"counter/number"}
+    assert completions("runner call ") >= {"account"}
+    assert completions("runner call account ") >= {"add", "collect"}
+    assert completions("runner call account add am") == {"amount="}
+    assert completions("runner ps --run acc") == {account.entry.run}
+
+
+@pytest.mark.parametrize(("shell", "word"), [("bash", "complete "), ("zsh", "compdef"), ("fish", "complete --command")])
+def test_completion_is_printed_for_a_shell(shell: str, word: str) -> None:
+    assert word in script(cast("Shell", shell))
+
+
+# ------------------------------------------------------------------------------------------ the end
+
+
+def test_log_lines_of_a_run_and_its_end_in_order(account: Run) -> None:
+    assert runner("call", "account", "add", "amount=2").stdout.splitlines()[0].endswith("account          2 added")
+    wait_for(lambda: "2 added" in runner("logs", "account").stdout)
+    follower = subprocess.Popen(
+        [sys.executable, "-m", "runner.cli", "logs", "-f"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert read_until(follower, "2 added")
+    assert runner("call", "account", "add", "amount=0").returncode == 2
+    assert read_until(follower, "nothing to add")
+    assert runner("down").stdout.startswith(f"{account.entry.run} has ended")
+    assert account.entry not in runs()
+    assert follower.wait(30) == 0
+    follower.communicate()
+    last = runner("logs", "--recordings", str(account.folder)).stdout
+    assert "2 added" in last
+    assert "nothing to add" in last
+    refused = runner("logs", "acount", "--recordings", str(account.folder))
+    assert "nothing from a stage 'acount'; did you mean 'account'" in refused.stderr
+    finished = account.finish()
+    assert finished.code == 0, finished.output
+    recording = Recording(finished.recording)
+    assert recording.verdict.complete
+    assert recording.envelope("supervisor.account_add#0").type == "Add"
+    replayed = runner("replay", str(finished.recording), "--verify")
+    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
