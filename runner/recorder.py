@@ -122,8 +122,9 @@ class RecordingWriter:
         self._queue: queue.SimpleQueue[_Payload | Callable[[], None] | None] = queue.SimpleQueue()
         self._counting = threading.Lock()
         self._waiting_bytes = 0
+        self._end = self._file.tell()
         self._unflushed: list[str] = []
-        """Ids that are not on their way to the disk yet."""
+        """Ids that the system does not have yet."""
         self._problems: list[str] = []
         self._dropped = 0
         self._recorded = 0
@@ -216,13 +217,22 @@ class RecordingWriter:
                 with self._counting:
                     self._waiting_bytes -= len(payload.data)
                 self._write(payload)
+                if self._file.tell() > self._end:
+                    self._handed_over()
             if time.monotonic() >= due:
                 self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
 
     def _flush(self) -> None:
+        """Closes the chunk by time."""
         self._writer.flush()
+        self._handed_over()
+
+    def _handed_over(self) -> None:
+        """Gives the system what closed chunks hold: a kill cannot take it back, also where a chunk closed by size."""
+        self._file.flush()
         self._unflushed.clear()
+        self._end = self._file.tell()
 
     def _write(self, payload: _Payload) -> None:
         try:

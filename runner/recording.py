@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
 from mcap.records import Channel, Metadata, Schema
 
 from runner.codec import CodecError, Envelope, LogLine, Step, unpack
@@ -131,6 +132,14 @@ class Ledger:
 def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     """The stages of a graph, as recorded, that run as replicas."""
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
+
+
+def _ids(text: str) -> list[str]:
+    """A JSON list of ids; nothing where the text is none."""
+    try:
+        return msgspec.json.decode(text, type=list[str])
+    except msgspec.MsgspecError:
+        return []
 
 
 def _readable(entry: Entry) -> bool:
@@ -275,7 +284,10 @@ class Recording:
         return envelopes
 
     def _missing(self) -> tuple[str, ...]:
+        """What the journal and the sequences name, and what the recorder could not keep."""
         ledger = Ledger(replicated(self.graph))
+        for id in _ids(self.metadata.get(VERDICT, {}).get("missing", "")):
+            ledger.lost(id)
         for id in self.messages:
             ledger.message(id)
         for step in self.steps:

@@ -1,4 +1,5 @@
 import os
+import resource
 import signal
 import subprocess
 import threading
@@ -103,6 +104,24 @@ def test_a_lost_message_is_in_the_verdict_and_the_exit_status(tmp_path: Path, pi
     session.journal(0, "camera.picture#0", "camera.picture#1")
     assert session.stop() == EXIT_INCOMPLETE
     assert "INCOMPLETE: 1 missing: camera.picture#1" in last_lines(session.log, 1)[0]
+
+
+def test_a_full_disk_stops_nobody_and_what_is_missing_is_named(tmp_path: Path, pictures: list[Picture]):
+    """The kernel refuses to let the file grow beyond a limit, as a full disk does."""
+    session = Session(tmp_path)
+    session.wait()
+    resource.prlimit(session.process.pid, resource.RLIMIT_FSIZE, (5_000_000, 5_000_000))
+    sent = [session.send(number, pictures[number % 3]) for number in range(12)]
+    for number, id in enumerate(sent):
+        session.journal(number, id)
+    assert session.stop() == EXIT_INCOMPLETE
+    said = last_lines(session.log, 1)[0]
+    assert "INCOMPLETE: writing failed: File too large" in said
+    recording = Recording(session.path)
+    there = set(recording.messages)
+    assert there < set(sent)
+    assert f"{12 - len(there)} missing: {sorted(set(sent) - there, key=sent.index)[0]}" in said
+    assert recording.torn
 
 
 def test_a_corrupt_message_is_refused_in_one_line_and_the_recorder_lives_on(tmp_path: Path, pictures: list[Picture]):

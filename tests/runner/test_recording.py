@@ -2,9 +2,14 @@ import hashlib
 import io
 import json
 import shutil
+import threading
 import time
+from collections import Counter
 from pathlib import Path
+from typing import IO
 
+import jsonschema
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,6 +17,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from runner import recorder as recorder_module
 from runner.codec import Envelope, LogLine, Step, envelope, open_envelope, pack
 from runner.container import Container, Growing, is_being_written
 from runner.contract import Refused
@@ -82,6 +88,23 @@ def test_any_mcap_reader_reads_it(toys: Path):
     assert (schema.name, schema.encoding) == ("Answer", "jsonschema")
     assert json.loads(schema.data)["title"] == "Answer"
     assert message.sequence == 0
+
+
+def test_another_reader_validates_every_payload_against_its_schema(toys: Path):
+    """msgpack and JSON Schema are all that is needed; binary data is compared as text."""
+    validated: Counter[str] = Counter()
+    with toys.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            assert schema is not None
+            described = json.loads(schema.data)
+            jsonschema.Draft202012Validator.check_schema(described)
+            value = msgpack.unpackb(message.data)
+            text = json.loads(json.dumps(value, default=lambda data: data.decode("latin-1")))
+            jsonschema.validate(text, described)
+            broken = {**text, "time_ns": "never"}
+            assert not jsonschema.Draft202012Validator(described).is_valid(broken)
+            validated[schema.name] += 1
+    assert validated == {"Number": 5, "Piece": 20, "Answer": 20, "Total": 5, "Finished": 1, "Step": 40}
 
 
 def test_says_what_ran_where(toys: Path):
@@ -164,6 +187,42 @@ def test_a_full_disk_ends_the_recording_and_not_the_process(tmp_path: Path):
     assert not verdict.complete
     assert "No space left on device" in verdict.reason
     assert "No space left on device" in refused[0]
+
+
+def test_a_disk_that_stalls_holds_nobody_up_and_what_does_not_fit_in_memory_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    create, disk = recorder_module._create, threading.Event()
+    monkeypatch.setattr(recorder_module, "_create", lambda path: _StalledDisk(create(path), disk))
+    monkeypatch.setattr(recorder_module, "BACKLOG_BYTES", 5000)
+    path = tmp_path / "stalled.mcap"
+    disk.set()
+    recorder = writer(path)
+    disk.clear()
+    for sequence in range(200):
+        recorder.put(Envelope, pack(number(sequence)))
+    disk.set()
+    verdict = recorder.close()
+    recording = Recording(path)
+    assert not verdict.complete
+    assert "payloads dropped: the disk was too slow" in verdict.reason
+    assert set(verdict.missing) == {f"counter.number#{sequence}" for sequence in range(200)} - set(recording.messages)
+    assert json.loads(recording.metadata["verdict"]["missing"]) == list(verdict.missing)
+    assert f"missing {verdict.missing[-1]}" in describe(path)
+
+
+class _StalledDisk:
+    """A file whose writes wait for the disk."""
+
+    def __init__(self, file: IO[bytes], disk: threading.Event) -> None:
+        self._file, self._disk = file, disk
+
+    def write(self, data: bytes) -> int:
+        self._disk.wait()
+        return self._file.write(data)
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
 
 
 class _FullDisk:
