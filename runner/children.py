@@ -67,7 +67,7 @@ def is_orphan() -> bool:
 
 def explain_death() -> None:
     """Has a crash in native code, and the supervisor's :data:`DUMP`, print where Python was."""
-    faulthandler.enable()
+    faulthandler.enable(all_threads=False)
     faulthandler.register(DUMP, all_threads=False)
 
 
@@ -101,10 +101,10 @@ def signal_group(child: subprocess.Popen[bytes] | Elsewhere, signum: signal.Sign
         return
 
 
-def last_lines(log: Path, count: int) -> list[str]:
-    """The last non-empty lines of what a child printed."""
+def last_lines(log: Path, count: int, start: int = 0) -> list[str]:
+    """The last non-empty lines of what a child printed; ``start`` is where its part of the file begins."""
     with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - TAIL_BYTES))
+        file.seek(max(start, log.stat().st_size - TAIL_BYTES))
         lines = file.read().decode(errors="replace").splitlines()
     return [line for line in lines if line.strip()][-count:]
 

@@ -38,6 +38,30 @@ class _Entry:
     """Whether it is in the consumer's memory, and survives this process."""
 
 
+class Courier:
+    """Sends the newest of a path from a thread of its own: a consumer that stands still holds nobody up."""
+
+    def __init__(self, send: Send):
+        self._send = send
+        self._waiting: dict[str, Payload] = {}
+        self._changed = threading.Condition()
+        threading.Thread(target=self._send_all, name="courier", daemon=True).start()
+
+    def take(self, path: str, payload: Payload) -> None:
+        """Sends soon; what waits on the same path is left out."""
+        with self._changed:
+            self._waiting[path] = payload
+            self._changed.notify()
+
+    def _send_all(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting)
+                path = next(iter(self._waiting))
+                payload = self._waiting.pop(path)
+            self._send(path, payload)
+
+
 class Outgoing:
     """One edge, seen from its publisher."""
 
@@ -46,7 +70,7 @@ class Outgoing:
         self._send = send
         self._live: set[int] = set()
         self._pending: dict[str, _Entry] = {}
-        self._acknowledged: deque[_Entry] = deque(maxlen=route.queue)
+        self._acknowledged: deque[_Entry] = deque(maxlen=route.kept)
         """The newest of what a restarted process may need again."""
 
     def has_room(self, lineage: str) -> bool:
@@ -140,7 +164,7 @@ class Delivery:
 
     def __init__(self, routes: Iterable[Route], send: Send, warn: Warn, stopping: Callable[[], bool]):
         """``stopping`` is asked again and again while a publisher waits."""
-        self._edges = [Outgoing(route, send) for route in routes]
+        self._edges = [Outgoing(route, send if route.policy == "block" else Courier(send).take) for route in routes]
         self._warn = warn
         self._held_back: deque[tuple[tuple[str, ...], Callable[[], None]]] = deque()
         self._changed = threading.Condition()

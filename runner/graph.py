@@ -154,6 +154,10 @@ class Node:
         """True where a message of this port is used for several parts."""
         return self.type.handler_of(port).keeps(self.type.inputs[port])
 
+    def kept(self, port: str) -> int:
+        """How many messages of a port parts that are under way may still need."""
+        return max(edge.queue for edge in self.inputs.values()) if self.keeps(port) else 0
+
     def construct(self) -> Stage:
         """A new instance with the node's settings."""
         cls = cast("Any", self.type.cls)
@@ -172,8 +176,9 @@ class Route(msgspec.Struct, frozen=True):
     queue: int
     shared: bool
     """Each message goes to one of the consumer's replicas."""
-    kept: bool
-    """The consumer uses a message for several steps; one that restarts needs it again."""
+    kept: int
+    """Messages that the consumer may use for further steps, and needs again when it restarts: as many as lineages may
+    be under way on any of its ports; 0 where it uses each once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +213,7 @@ class Graph:
     def routes(self, stage: str) -> list[Route]:
         """Every edge that leaves a stage."""
         return [
-            Route(edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.keeps(port))
+            Route(edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port))
             for node in self.nodes.values()
             for port, edge in node.inputs.items()
             if edge.stage == stage

@@ -24,7 +24,7 @@ from runner.contract import Level, Refused
 from runner.delivery import Delivery, Stopped
 from runner.graph import Route, node_from_entry
 from runner.health import Heart
-from runner.inbox import Inbox, Mismatched, Ready
+from runner.inbox import Inbox, Mailbox, Mismatched, Ready
 from runner.network import Network
 from runner.past import past_of, relive
 from runner.ports import Handler
@@ -98,16 +98,13 @@ class Host:
             log=self._log,
             numbers=assignment.numbers,
         )
-        self._deliveries: queue.SimpleQueue[Packet | None] = queue.SimpleQueue()
+        self._mailbox = Mailbox(self._node)
         self._receipts: deque[Receipt] = deque()
         self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
         """(port, id) of what has arrived, and whether it is consumed."""
-        self._remember(assignment.consumed)
+        self._remember(one for one in assignment.consumed if not self._node.keeps(one[0]))
         self._refusals = Refusals(lambda text: self._log(text, "error"))
         self._steps = 0
-        self._received = dict.fromkeys(self._node.inputs, 0)
-        """Messages by port; the bus' thread counts these, the main thread those that it has decoded."""
-        self._decoded = dict.fromkeys(self._node.inputs, 0)
         self._present: _Record | None = None
         """The step that runs."""
         self._sent: dict[str, tuple[int, int]] = dict.fromkeys(self._node.type.outputs, (0, 0))
@@ -124,14 +121,14 @@ class Host:
     def stop(self) -> None:
         """Ends :meth:`run` after the present step. May be called from a signal handler."""
         self._stopping.set()
-        self._deliveries.put(None)
+        self._mailbox.wake()
 
     def retire(self) -> None:
         """Ends :meth:`run` after the whole present step; a successor does the rest. May be called from a signal
         handler.
         """
         self._retiring.set()
-        self._deliveries.put(None)
+        self._mailbox.wake()
 
     def close(self) -> None:
         """Lets the recorder catch up, then releases the stage and the bus."""
@@ -169,8 +166,8 @@ class Host:
             "busy_ns": 0 if record is None else record.busy_ns,
             "steps": self._steps,
             "refused": self._refusals.count,
-            "queued": {port: self._received[port] - self._decoded[port] + waiting for port, waiting in queued.items()},
-            "skipped": dict(self._inbox.skipped),
+            "queued": {port: waiting + self._mailbox.waiting(port) for port, waiting in queued.items()},
+            "skipped": self._skipped(),
             "unanswered": self._delivery.unanswered(),
             "sent": dict(self._sent),
         }
@@ -199,12 +196,10 @@ class Host:
     def _hand_over(self, packet: Packet) -> None:
         """To the thread that runs steps, before anything else is done about it; then comes :meth:`_on_delivery`."""
         port = _port_of(packet)
-        if port in self._received:
-            self._received[port] += 1
         with contextlib.suppress(CodecError):  # what is malformed is refused by who takes it
             id = admit(Envelope, packet).id
             self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
-        self._deliveries.put(packet)
+        self._mailbox.put(packet)
 
     def _on_delivery(self, _: Packet) -> None:
         """Gives receipts at once, however long the present step takes."""
@@ -214,8 +209,6 @@ class Host:
     def _take(self, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
         name = _port_of(packet)
-        if name in self._decoded:
-            self._decoded[name] += 1
         try:
             envelope = codec.unpack(Envelope, packet.payload)
             if packet.genuine and (name, envelope.id) in self._arrived:
@@ -252,10 +245,10 @@ class Host:
     def _take_all(self, *, wait: bool) -> None:
         """Takes every packet that is there; waits for one if there is nothing else to do."""
         with contextlib.suppress(queue.Empty):
-            delivered = self._deliveries.get(block=wait and not self._inbox.has_ready)
-            while delivered is not None:
-                self._take(delivered)
-                delivered = self._deliveries.get_nowait()
+            packet = self._mailbox.fetch(wait=wait and not self._inbox.has_ready)
+            while packet is not None:
+                self._take(packet)
+                packet = self._mailbox.fetch(wait=False)
 
     def _step(self, ready: Ready) -> None:
         """Runs one handler to its end and journals it."""
@@ -322,9 +315,12 @@ class Host:
         """Records what was never worked on."""
         for handler, lineage, lacking in self._inbox.incomplete():
             self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-        for port, skipped in self._inbox.skipped.items():
+        for port, skipped in self._skipped().items():
             if skipped:
                 self._log(f"{port}: {skipped} messages were replaced by newer ones before they were read", "debug")
+
+    def _skipped(self) -> dict[str, int]:
+        return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
 
     def _remember(self, consumed: Iterable[tuple[str, str]]) -> None:
         for key in consumed:

@@ -1,14 +1,64 @@
 """Puts messages together to steps: joins and gathers by lineage, whatever the order of arrival."""
 
+import queue
+import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import cast
 
+from runner.bus import Packet
 from runner.contract import Part
 from runner.graph import Node
 from runner.ports import Handler, InputPort
 from runner.step import Arrival
+
+
+class Mailbox:
+    """What has arrived and is not decoded, in order of arrival; of a port of policy ``latest`` only the newest."""
+
+    def __init__(self, node: Node):
+        self._latest = {port for port, edge in node.inputs.items() if edge.policy == "latest"}
+        self._queue: queue.SimpleQueue[Packet | str | None] = queue.SimpleQueue()
+        self._newest: dict[str, Packet] = {}
+        self._exchanging = threading.Lock()
+        self._come = dict.fromkeys(node.inputs, 0)
+        """By port; the link's thread counts these, the main thread those that it has fetched."""
+        self._fetched = dict.fromkeys(node.inputs, 0)
+        self.replaced = dict.fromkeys(node.inputs, 0)
+        """Messages that a newer one replaced before they were decoded."""
+
+    def put(self, packet: Packet) -> None:
+        """Takes a packet from the link's thread."""
+        port = packet.key.rpartition("/")[2]
+        if port not in self._latest or not packet.genuine:
+            if port in self._come:
+                self._come[port] += 1
+            self._queue.put(packet)
+            return
+        with self._exchanging:
+            self.replaced[port] += port in self._newest
+            if port not in self._newest:
+                self._queue.put(port)
+            self._newest[port] = packet
+
+    def wake(self) -> None:
+        """Makes who waits look up. May be called from a signal handler."""
+        self._queue.put(None)
+
+    def fetch(self, *, wait: bool) -> Packet | None:
+        """The next packet; None when woken. Raises queue.Empty where there is none and it need not wait."""
+        item = self._queue.get(block=wait)
+        if isinstance(item, str):
+            with self._exchanging:
+                return self._newest.pop(item)
+        if item is not None and (port := item.key.rpartition("/")[2]) in self._fetched:
+            self._fetched[port] += 1
+        return item
+
+    def waiting(self, port: str) -> int:
+        """How many packets of a port wait. May be called from any thread."""
+        return self._come[port] - self._fetched[port] + (port in self._newest)
 
 
 class Mismatched(Exception):

@@ -17,6 +17,7 @@ from pathlib import Path
 import msgspec
 
 from runner import codec
+from runner.backpressure import skipped
 from runner.bus import RECORDER, Bus, Packet, Presence, Process, free_endpoint
 from runner.calls import CallQuestion, CallRequest, Calls
 from runner.children import DUMP, ending, last_lines, signal_group, spawn
@@ -49,7 +50,7 @@ SETTLE_SECONDS = 30.0
 RETIRE_SECONDS = 30.0
 """What a process that is asked to restart may take for its present step; a killed step is done again."""
 ASKED = "asked to restart"
-SHOWN_LINES = 12
+SHOWN_LINES = 16
 EXIT_INCOMPLETE = 3
 
 
@@ -79,6 +80,8 @@ class _Child:
     watch: Watch = field(default_factory=lambda: Watch(Limits()))
     oom_kills: int = field(default_factory=oom_kills)
     """By the kernel, before it was started."""
+    log_from: int = 0
+    """Where its own lines begin in the log."""
     condemned: str = ""
     """Why the supervisor kills it."""
     dies_at: float = float("inf")
@@ -90,7 +93,7 @@ class _Child:
         if self.condemned:
             return self.condemned
         code = self.handle.returncode
-        lines = last_lines(self.log, 1)
+        lines = last_lines(self.log, 1, self.log_from)
         if lines and code is not None and code >= 0:
             return lines[0]
         held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
@@ -321,7 +324,8 @@ class Supervisor:
 
     def _spawn(self, process: Process, module: str, task: bytes) -> _Child:
         log = self._log_of(process)
-        return _Child(process, spawn(module, task=task, log=log), log)
+        log_from = log.stat().st_size if log.exists() else 0
+        return _Child(process, spawn(module, task=task, log=log), log, log_from=log_from)
 
     def _log_of(self, process: Process) -> Path:
         return self.directory / "log" / f"{process.stage}-{process.replica}.txt"
@@ -445,7 +449,7 @@ class Supervisor:
     def _conclude(self, end: End, verdict: str) -> End:
         complete = self._recorder is not None and self._recorder.handle.returncode == 0
         if self._steps:
-            self._terminal.plain("", *stage_times(self._steps), "")
+            self._terminal.plain("", *stage_times(self._steps), *skipped(self._graph, self._steps), "")
         self._terminal.plain(f"recording {verdict}")
         return end if complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
 
@@ -547,7 +551,7 @@ class Supervisor:
 
     def _show_output(self, child: _Child) -> None:
         name = self._name_of(child.process.stage, child.process.replica)
-        for line in last_lines(child.log, SHOWN_LINES):
+        for line in last_lines(child.log, SHOWN_LINES, child.log_from):
             self._terminal.show(name, f"| {line}", "error")
 
     def _name_of(self, stage: str, replica: int) -> str:

@@ -1,6 +1,8 @@
 """A publisher keeps what is not acknowledged, hands parts of the dead to the living and waits when it must."""
 
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -18,17 +20,28 @@ class Wire:
     def __init__(self) -> None:
         self.sent: list[tuple[int, str]] = []
         self.stopping = threading.Event()
+        self.standing_still = threading.Lock()
+        self.sending = ""
 
     def send(self, path: str, payload: bytes) -> None:
-        self.sent.append((int(path.split("/")[2]), payload.decode()))
+        self.sending = payload.decode()
+        with self.standing_still:
+            self.sent.append((int(path.split("/")[2]), payload.decode()))
 
     def take(self) -> list[tuple[int, str]]:
         sent, self.sent = self.sent, []
         return sent
 
 
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
 def make(**changes: Any) -> tuple[Delivery, Wire]:
-    route = Route("number", "worker", "input", "block", queue=4, shared=False, kept=False)
+    route = Route("number", "worker", "input", "block", queue=4, shared=False, kept=0)
     wire = Wire()
     routes = [msgspec.structs.replace(route, **changes)]
     return Delivery(routes, wire.send, lambda _: None, wire.stopping.is_set), wire
@@ -62,7 +75,7 @@ def test_a_restarted_consumer_gets_what_it_has_not_acknowledged():
 
 
 def test_what_joins_share_is_sent_again_though_acknowledged():
-    delivery, wire = make(kept=True)
+    delivery, wire = make(kept=4)
     first = publish(delivery, 0)
     delivery.acknowledge("worker", [("input", first)])
     delivery.update(Process("worker", 1), True)
@@ -122,7 +135,19 @@ def test_an_edge_of_policy_latest_never_blocks_and_keeps_the_newest():
     delivery, wire = make(policy="latest", queue=1)
     ids = [publish(delivery, number) for number in range(5)]
     delivery.update(Process("worker", 0), True)
+    wait_until(lambda: len(wire.sent) > 0)
     assert wire.take() == [(0, ids[-1])]
+
+
+def test_a_consumer_of_policy_latest_that_stands_still_holds_nobody_up():
+    delivery, wire = make(policy="latest", queue=1)
+    delivery.update(Process("worker", 0), True)
+    with wire.standing_still:
+        first = publish(delivery, 0)
+        wait_until(lambda: wire.sending == first)
+        ids = [publish(delivery, number) for number in range(1, 100)]
+    wait_until(lambda: len(wire.sent) == 2)
+    assert wire.take() == [(0, first), (0, ids[-1])]
 
 
 def test_a_step_is_journalled_once_its_messages_have_arrived():

@@ -45,7 +45,7 @@ def start(graph: Path, folder: Path, *settings: str) -> subprocess.Popen[str]:
 
 def finish(process: subprocess.Popen[str], folder: Path, before: str = "") -> Run:
     try:
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=150)
     finally:
         process.kill()
     return Run(process.returncode, before + output, folder)
