@@ -10,15 +10,16 @@ import json
 import os
 import tempfile
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from runner.contract import Refused, Tolerances
+from runner.contract import Refused, Tolerance, Tolerances
 from runner.document import Document
-from runner.graph import Graph, Node, graph_from_json
+from runner.graph import Graph, Node, graph_from_json, graph_to_json, node_from_entry
 from runner.info import seconds, table
 from runner.recording import Recording, replicated
 from runner.summary import Summary
@@ -27,12 +28,6 @@ from runner.tolerances import Origin, load_tolerances
 from runner.workshop import Job, run_each
 
 Say = Callable[[str], None]
-
-
-def read(path: Path, assignments: Sequence[str] = ()) -> tuple[Recording, Graph]:
-    """A recording and its graph, changed by ``--set`` assignments; raises Refused where either is not readable."""
-    recording = Recording(path)
-    return recording, graph_from_json(changed_graph(recording, assignments), str(path))
 
 
 def changed_graph(recording: Recording, assignments: Sequence[str]) -> str:
@@ -45,7 +40,8 @@ def changed_graph(recording: Recording, assignments: Sequence[str]) -> str:
 
 def plan(path: Path, say: Say) -> int:
     """Says what a replay would execute."""
-    recording, graph = read(path)
+    recording = Recording(path)
+    graph = graph_from_json(json.dumps(recording.graph), str(path))
     say(f"{path}: {recording.verdict}")
     for line in _plan(recording, graph):
         say(line)
@@ -74,30 +70,34 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: 
     graph's tolerances; else 1. Raises Refused where the file is no recording.
     """
     began = time.perf_counter()
-    recording, graph = read(path, assignments)
+    recording = Recording(path)
     origin = Origin(recording)
     for line in origin.lines():
         say(line)
     say(f"{path}: {recording.verdict}")
-    verification = _Verification(recording, graph, {} if origin.same else load_tolerances(graph), say)
+    values, tolerances = recording.graph, dict[str, Tolerance]()
+    if assignments or not origin.same:  # else it was checked when it was recorded: classes are imported as they come
+        graph = graph_from_json(changed_graph(recording, assignments), str(path))
+        values, tolerances = json.loads(graph_to_json(graph)), {} if origin.same else load_tolerances(graph)
+    verification = _Verification(recording, values, tolerances, say)
     return verification.conclude(verification.run(workers or len(os.sched_getaffinity(0))), began)
 
 
 class _Verification:
     """One replay of everything."""
 
-    def __init__(self, recording: Recording, graph: Graph, tolerances: Tolerances, say: Say) -> None:
+    def __init__(self, recording: Recording, graph: dict[str, Any], tolerances: Tolerances, say: Say) -> None:
         self._recording = recording
         self._graph = graph
         self._tolerances = tolerances
         self._say = say
+        self._executed: list[str] = []
 
     def run(self, workers: int) -> list[Result]:
         """Executes every task and says how each ended."""
         results: list[Result] = []
-        tasks = tasks_of(self._recording, executed(self._graph), workers)
         with tempfile.TemporaryDirectory() as folder:
-            jobs = [Job(task, lambda task=task: self._work(task, Path(folder))) for task in tasks]
+            jobs = self._jobs(workers, Path(folder))
             for task, answer in run_each(jobs, workers=workers, folder=Path(folder)):
                 failed = isinstance(answer, str)
                 result = Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
@@ -105,17 +105,26 @@ class _Verification:
                 results.append(result)
         return results
 
-    def _work(self, task: Task, folder: Path) -> bytes:
+    def _jobs(self, workers: int, folder: Path) -> Iterator[Job[Task]]:
+        """Every task, longest stages first, so that the workers end together; each is imported when it is drawn."""
+        for stage in _by_cost(self._recording):
+            node = node_from_entry(stage, self._graph["stages"][stage])
+            if not node.type.cls.device:
+                self._executed.append(stage)
+                for task in tasks_of(self._recording, node, workers):
+                    yield Job(task, lambda node=node, task=task: self._work(node, task, folder))
+
+    def _work(self, node: Node, task: Task, folder: Path) -> bytes:
         """Executes one task; runs in the task's own process."""
         try:
-            return msgspec.json.encode(self._result(task, folder))
+            return msgspec.json.encode(self._result(node, task, folder))
         except Refused as refusal:
             return msgspec.json.encode(Result(failure=str(refusal)))
 
-    def _result(self, task: Task, folder: Path) -> Result:
-        node, began = self._graph.nodes[task.stage], time.perf_counter()
-        steps = steps_of(self._recording, task, node)
-        again = Reenactment(self._recording, node, steps, seed=self._graph.seed, directory=_files(folder))
+    def _result(self, node: Node, task: Task, folder: Path) -> Result:
+        began = time.perf_counter()
+        steps, files = steps_of(self._recording, task, node), Path(tempfile.mkdtemp(dir=folder))
+        again = Reenactment(self._recording, node, steps, seed=self._graph["seed"], directory=files)
         startup = time.perf_counter() - began
         comparison = Comparison(self._recording, node, self._tolerances)
         for step in steps:
@@ -128,15 +137,16 @@ class _Verification:
         wall = time.perf_counter() - began
         for line in Summary(change for result in results for change in result.changes).lines():
             self._say(line)
+        recorded = sum(step.computed_ns for step in self._recording.steps if step.stage in self._executed)
         self._say(
             f"replayed in {wall:.1f} s: handlers took {sum(result.seconds for result in results):.1f} s, "
-            f"when recorded {sum(self._computed()) * 1e-9:.1f} s; "
+            f"when recorded {recorded * 1e-9:.1f} s; "
             f"constructing the stages {sum(result.startup for result in results):.1f} s"
         )
         return self._verdict(results)
 
     def _verdict(self, results: Sequence[Result]) -> int:
-        names = [node.name for node in executed(self._graph)]
+        stages = f"of {len(self._executed)} stages"
         compared, within = sum(result.messages for result in results), sum(result.within for result in results)
         found = sorted((result.first for result in results if result.first), key=lambda found: found.position)
         verdict = self._recording.verdict
@@ -144,40 +154,34 @@ class _Verification:
             self._say(f"DIVERGED first at {found[0]}")
             return 1
         if any(result.failure for result in results) or not verdict.complete:
-            expected = emitted_by(names, self._recording)
+            expected = emitted_by(self._executed, self._recording)
             none = "none differs" if not within else f"{within} within tolerances, none beyond"
             self._say(f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {verdict}")
             return 1
         if within:
-            counts = f"{within} of {compared} messages of {len(names)} stages differ"
-            self._say(f"WITHIN TOLERANCES: {counts}, no field by more than {self._graph.tolerances} allows")
+            table = self._graph.get("tolerances")
+            self._say(
+                f"WITHIN TOLERANCES: {within} of {compared} messages {stages} differ, none by more than {table} allows"
+            )
         else:
-            self._say(f"IDENTICAL: {compared} messages of {len(names)} stages")
+            self._say(f"IDENTICAL: {compared} messages {stages}")
         return 0
 
-    def _computed(self) -> Iterator[int]:
-        names = {node.name for node in executed(self._graph)}
-        return (step.computed_ns for step in self._recording.steps if step.stage in names)
 
-
-def _files(folder: Path) -> Path:
-    """An empty folder for what a stage writes."""
-    return Path(tempfile.mkdtemp(dir=folder))
-
-
-def tasks_of(recording: Recording, nodes: Iterable[Node], workers: int) -> list[Task]:
-    """Every task of a replay, longest first, so that the workers end together."""
-    cost: dict[tuple[str, int], int] = defaultdict(int)
-    shared, kinds = replicated(recording.graph), {node.name: node.type.cls for node in nodes}
+def _by_cost(recording: Recording) -> list[str]:
+    """The stages that took steps, those that computed longest first."""
+    cost: Counter[str] = Counter()
     for step in recording.steps:
-        if step.stage in kinds:
-            together = step.stage in shared or kinds[step.stage].stateful
-            cost[step.stage, 0 if together else step.incarnation] += step.computed_ns
-    tasks: list[Task] = []
-    for stage, incarnation in sorted(cost, key=lambda key: -cost[key]):
-        shares = workers if stage in shared else 1
-        tasks += [Task(stage, incarnation, share, shares) for share in range(shares)]
-    return tasks
+        cost[step.stage] += step.computed_ns
+    return [stage for stage, _ in cost.most_common() if stage in recording.graph["stages"]]
+
+
+def tasks_of(recording: Recording, node: Node, workers: int) -> list[Task]:
+    """Every task of one stage: shares of what its replicas did, one for a stateful stage, else one a process."""
+    if node.name in replicated(recording.graph):
+        return [Task(node.name, 0, share, workers) for share in range(workers)]
+    lived = {step.incarnation for step in recording.steps if step.stage == node.name}
+    return [Task(node.name, incarnation) for incarnation in ([0] if node.type.cls.stateful else sorted(lived))]
 
 
 def emitted_by(stages: Sequence[str], recording: Recording) -> int:

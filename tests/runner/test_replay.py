@@ -54,7 +54,7 @@ def test_every_message_is_identical(toys: Path):
     code, said = verify(toys)
     assert code == 0, said
     assert "worker (1 of 2): 10 steps, 10 messages" in said
-    assert "IDENTICAL: 45 messages of 4 stages" in said
+    assert "IDENTICAL: 45 messages of 3 stages" in said
     assert "counter" not in said.partition("IDENTICAL")[0].replace(str(toys), "")
 
 
@@ -198,7 +198,7 @@ def test_on_another_machine_it_says_so_first_and_tolerances_apply(toys: Path, tm
     code, said = verify(elsewhere(toys, tmp_path / "near.mcap", 1e-7), TABLE)
     assert code == 0, said
     assert said.startswith("FINGERPRINT DIFFERS: processor Z80 -> ")
-    assert "WITHIN TOLERANCES: 2 of 45 messages of 4 stages differ, no field by more than " in said
+    assert "WITHIN TOLERANCES: 2 of 45 messages of 3 stages differ, none by more than " in said
     assert "IDENTICAL" not in said
 
 
@@ -247,4 +247,4 @@ def test_a_table_that_is_none_is_refused(toys: Path, tmp_path: Path, table: str,
 def test_any_number_of_workers_gives_the_same_bytes(toys: Path, workers: int):
     code, said = verify(toys, workers=workers)
     assert code == 0, said
-    assert "IDENTICAL: 45 messages of 4 stages" in said
+    assert "IDENTICAL: 45 messages of 3 stages" in said
