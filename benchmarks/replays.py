@@ -73,17 +73,18 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=1, help="replays")
     parser.add_argument("--load", type=int, default=0, help="busy loops meanwhile")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="stages at the same time")
+    parser.add_argument("--set", action="append", default=[], dest="settings", help="as `runner replay --set`")
     options = parser.parse_args()
     with busy(options.load):
-        outcomes = list(_replays(options.file.absolute(), options.times, options.workers))
+        outcomes = list(_replays(options.file.absolute(), options.times, options.workers, options.settings))
     for line in report(outcomes, options.workers, options.load):
         print(line)
     sys.exit(not all(outcome.identical for outcome in outcomes))
 
 
-def _replays(path: Path, times: int, workers: int) -> Iterator[Outcome]:
+def _replays(path: Path, times: int, workers: int, settings: Sequence[str]) -> Iterator[Outcome]:
     for number in range(1, times + 1):
-        outcome = replay_once(path, workers=workers)
+        outcome = replay_once(path, workers=workers, settings=settings)
         if not outcome.identical:
             print(f"replay {number}: {outcome.verdict}", flush=True)
         yield outcome

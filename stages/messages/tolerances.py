@@ -14,19 +14,19 @@ from runner.contract import Tolerance
 PIXELS = Tolerance(0.5)
 SHARE = Tolerance(0.01)
 """Confidences and visible shares, which lie between 0 and 1."""
-PROBABILITY = Tolerance(0.1)
-"""Fitted log-odds are steep about a half."""
-POSE = Tolerance(5e-3)
-"""Metres, and entries of a rotation (0.3 degrees): a filter that rounds otherwise takes another way there."""
-PLANE = Tolerance(1e-3)
-COST = Tolerance(1e-2)
+PROBABILITY = Tolerance(0.01)
+POSE = Tolerance(1e-3)
+"""Metres, and entries of a rotation (0.06 degrees): a filter that rounds otherwise takes another way there."""
+PLANE = Tolerance(1e-6)
+"""Poses that one formula gives, with no search in between."""
+COST = Tolerance(1e-4)
 """Of a likelihood, metres per pixel of an object."""
-WEIGHT = Tolerance(5.0)
-"""Logarithms of unnormalised weights: hundreds apart where scenes differ."""
+WEIGHT = Tolerance(0.1)
+"""Logarithms of unnormalised weights."""
 IMAGE = Tolerance(share=1e-3)
 """A reading at a threshold falls on the other side."""
 SHOWN = Tolerance(math.inf)
-"""For people to look at, or to start from: how a filter came to its result."""
+"""How a filter came to its result, and where it starts: of symmetric poses another one may come first."""
 
 TOLERANCES = {
     "Candidate.box": PIXELS,
@@ -38,9 +38,9 @@ TOLERANCES = {
     "ParticleTrace.iterations": SHOWN,
     "ParticleTrace.costs": SHOWN,
     "ParticleTrace.positions": SHOWN,
-    "Start.T_camera_object": POSE,
-    "Glimpse.left": Tolerance(4.0),
-    "Glimpse.top": Tolerance(4.0),
+    "Start.T_camera_object": SHOWN,
+    "Glimpse.left": SHOWN,
+    "Glimpse.top": SHOWN,
     "Glimpse.inverse": SHOWN,
     "Glimpse.change": SHOWN,
     "Placed.T_camera_object": POSE,
@@ -52,11 +52,11 @@ TOLERANCES = {
     "ObjectPose.confidence": SHARE,
     "ObjectPose.cost": COST,
     "ObjectPose.box": PIXELS,
-    "ObjectPose.visible": Tolerance(0.05),
+    "ObjectPose.visible": SHARE,
     "ObjectPose.probability": PROBABILITY,
     "ObjectPose.spread_metres": POSE,
-    "ObjectPose.spread_radians": Tolerance(0.1),
-    "ObjectPose.looked_through": Tolerance(0.05),
+    "ObjectPose.spread_radians": Tolerance(0.01),
+    "ObjectPose.looked_through": SHARE,
     "Alternative.T_camera_object": POSE,
     "Alternative.probability": PROBABILITY,
     "UnknownRegion.box": Tolerance(2.0),

@@ -12,7 +12,7 @@ from tests.runner.test_runs import TOYS, Run, run
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run in which the replica that works on the third number is killed."""
-    return run(TOYS, tmp_path_factory.mktemp("killed"), "worker.replicas=3", "worker.die_at=2")
+    return run(TOYS, tmp_path_factory.mktemp("killed"), "worker.replicas=3", "worker.die_at=2", "counter.period=0.3")
 
 
 @pytest.fixture(scope="module")
