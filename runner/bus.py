@@ -263,20 +263,23 @@ class Bus:
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
 
-        What it raises becomes an error reply: the text of a Refused, of anything else its type too.
+        Who does not know the run's secret is refused. What it raises becomes an error reply: the text of a Refused, of anything else its type too.
         """
         key = f"{self._run}/q/{name}"
 
+        badge = _badge(self._secret, f"q/{name}")
+
         def receive(query: zenoh.Query) -> None:
-            threading.Thread(target=_reply, args=(query, key, answer), name=name, daemon=True).start()
+            threading.Thread(target=_reply, args=(query, key, badge, answer), name=name, daemon=True).start()
 
         self._declared.append(self._session.declare_queryable(key, Callback(receive, indirect=False)))
 
     def ask(self, name: str, question: bytes, timeout_s: float) -> bytes:
         """The answer of whoever serves ``name``; raises Refused with its reason, or where nobody answers in time."""
-        deadline = time.monotonic() + timeout_s
+        deadline, badge = time.monotonic() + timeout_s, _badge(self._secret, f"q/{name}")
         while (left := deadline - time.monotonic()) > 0:
-            for reply in self._session.get(f"{self._run}/q/{name}", payload=question, timeout=left):
+            key = f"{self._run}/q/{name}"
+            for reply in self._session.get(key, payload=question, attachment=badge, timeout=left):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and reply.err.encoding == REFUSAL:
@@ -291,7 +294,8 @@ class Bus:
         self._calls.put(None)
         if threading.current_thread() is not self._caller:
             self._caller.join(FLUSH_SECONDS)
-        self._session.close()
+        with contextlib.suppress(zenoh.ZError):  # who is cut off cannot say goodbye
+            self._session.close()
 
     def _in_turn(self, receive: Callable[[A, int], None]) -> Callback[A]:
         """A handler that only queues, so that it may run on the link's own thread; it gets the time of arrival."""
@@ -351,9 +355,11 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:
+def _reply(query: zenoh.Query, key: str, badge: bytes, answer: Callable[[bytes], bytes]) -> None:
     with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
         try:
+            if query.attachment is None or query.attachment.to_bytes() != badge:
+                raise Refused("only who knows the secret of this run may ask")
             query.reply(key, answer(query.payload.to_bytes() if query.payload else b""))
         except Refused as refusal:
             query.reply_err(str(refusal), encoding=REFUSAL)
