@@ -263,7 +263,8 @@ class Bus:
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
 
-        Who does not know the run's secret is refused. What it raises becomes an error reply: the text of a Refused, of anything else its type too.
+        Who does not know the run's secret is refused. What ``answer`` raises becomes an error reply: the text of a
+        Refused, of anything else its type too.
         """
         key = f"{self._run}/q/{name}"
 

@@ -37,7 +37,7 @@ class Live:
         """Raises Refused where the run does not answer any more."""
         self.entry = entry
         try:
-            self.bus = Bus(entry.run, connect=entry.endpoint, network=entry.network, guest=True)
+            self.bus = Bus(entry.run, connect=entry.endpoint, network=entry.network, secret=entry.secret, guest=True)
         except zenoh.ZError as error:
             raise Refused(f"{entry.run}: cannot be reached at {entry.endpoint}: {error}") from None
 

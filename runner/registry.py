@@ -27,6 +27,8 @@ class Entry(msgspec.Struct, frozen=True):
     """Path of the file that is being written."""
     started: float
     """Seconds since the epoch."""
+    secret: str = ""
+    """What those who ask show that they may: only this user can read it."""
     network: Network | None = None
     """What the run's network asks of its peers; None on loopback."""
 

@@ -145,6 +145,7 @@ class Supervisor:
             graph=str(file.absolute()),
             recording=str(self.recording.absolute()),
             started=time.time(),
+            secret=self._secret,
             network=self._network,
         )
         self._registration = Registration(self._entry)

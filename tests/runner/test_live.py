@@ -114,7 +114,8 @@ def test_a_question_is_answered_refused_or_not_heard() -> None:
         return question * 2
 
     endpoint = free_endpoint()
-    server, client = Bus("toys", listen=endpoint), Bus("toys", connect=endpoint)
+    server, client = (Bus("toys", secret="s", listen=endpoint), Bus("toys", secret="s", connect=endpoint))
+    stranger = Bus("toys", connect=endpoint)
     server.serve("double", answer)
     try:
         assert client.ask("double", b"ab", 20) == b"abab"
@@ -124,8 +125,11 @@ def test_a_question_is_answered_refused_or_not_heard() -> None:
             client.ask("double", b"raise", 20)
         with pytest.raises(Refused, match=r"toys: no answer to 'halve' within 0.2 s"):
             client.ask("halve", b"ab", 0.2)
+        with pytest.raises(Refused, match="only who knows the secret of this run"):
+            stranger.ask("double", b"ab", 20)
     finally:
         client.close()
+        stranger.close()
         server.close()
 
 
