@@ -510,7 +510,8 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
     replicas = len(os.sched_getaffinity(0)) if entry.replicas == "auto" else max(entry.replicas, len(placement))
     parts = [port.name for port in kind.inputs.values() if issubclass(port.type, Part) and port.kind == "one"]
     if (entry.replicas != 1 or replicas != 1) and not parts:
-        raise Refused(f"{document.place(*keys, 'replicas')}: {entry.stage} takes no Part, which is what replicas share")
+        place = document.place(*keys, "replicas" if entry.replicas != 1 else "host")
+        raise Refused(f"{place}: {entry.stage} takes no Part, which is what replicas share")
     restarts = entry.restarts if entry.restarts is not None else 0 if kind.cls.device else RESTARTS
     if kind.cls.stateful and replicas > 1:
         place = document.place(*keys, "replicas")

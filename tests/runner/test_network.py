@@ -1,0 +1,226 @@
+"""Hosts in graph files: what is read from them, what is refused as unsafe, and what never crosses."""
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import msgspec
+import pytest
+import zenoh
+
+from runner import bus
+from runner.bus import Bus, Presence, Process, free_endpoint
+from runner.codec import Envelope
+from runner.contract import Refused
+from runner.delivery import Delivery
+from runner.document import Document, read_document
+from runner.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
+from runner.hosts import differences, moved
+from runner.network import Host, Layout, read_layout, read_owners
+from tests.runner.machines import HOSTS
+
+OUT = "sink.path=out.txt"
+LINE = "hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1, worker2: 127.0.0.1}"
+PLACED = "host: {worker1: 1, worker2: 1}"
+
+
+def load(folder: Path, *settings: str, old: str = "", new: str = "") -> Graph:
+    assert old in HOSTS.read_text()
+    path = folder / "graph.yaml"
+    path.write_text(HOSTS.read_text().replace(old, new) if old else HOSTS.read_text())
+    return load_graph(path, (OUT, *settings))
+
+
+def layout(**values: object) -> Layout:
+    return read_layout(Document("graph.yaml", Path("/lab"), values))
+
+
+# ---------------------------------------------------------------------------------------------- placement
+
+
+def test_each_process_has_its_host(tmp_path: Path):
+    graph = load(tmp_path)
+    assert graph.layout.names == ("head", "worker1", "worker2")
+    assert graph.nodes["worker"].replicas == 2
+    assert {key: graph.host_of(*key) for key in graph.processes()} == {
+        ("counter", 0): "head",
+        ("splitter", 0): "head",
+        ("worker", 0): "worker1",
+        ("worker", 1): "worker2",
+        ("gatherer", 0): "worker2",
+        ("sink", 0): "head",
+    }
+
+
+def test_all_replicas_go_to_one_host_that_is_named(tmp_path: Path):
+    graph = load(tmp_path, old=PLACED, new="host: worker2\n    replicas: 3")
+    assert graph.nodes["worker"].placement == ("worker2",) * 3
+
+
+def test_hosts_and_places_may_be_set(tmp_path: Path):
+    graph = load(tmp_path, "hosts.head=127.0.0.1:9000", "gatherer.host=worker1")
+    assert graph.layout.endpoint == "tcp/127.0.0.1:9000"
+    assert graph.host_of("gatherer", 0) == "worker1"
+
+
+def test_a_graph_may_run_here_and_is_read_back_for_one_machine(tmp_path: Path):
+    graph = load(tmp_path)
+    assert (graph.here().layout.hosts, graph.here().host_of("worker", 1)) == ((), None)
+    read = graph_from_json(graph_to_json(graph))
+    assert (read.layout.hosts, read.nodes["worker"].replicas) == ((), 2)
+    assert node_from_entry("worker", node_entry(graph.nodes["worker"])).placement == ()
+
+
+# ---------------------------------------------------------------------------------------------- refusals
+
+OPEN = "is not loopback, and without keys anybody who reaches it could take part; type: runner keys init .*, and add"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (LINE, LINE.replace("worker1: 127.0.0.1", "worker1: 10.0.0.2"), f":3: hosts.worker1: 10.0.0.2 {OPEN}"),
+        (LINE, LINE.replace("head: 127.0.0.1:7447", "head: lab.local:7447"), f":3: hosts.head: lab.local {OPEN}"),
+        (LINE, f"{LINE}\nrouter: 10.0.0.9:7447", f":4: router: 10.0.0.9 {OPEN}"),
+        (LINE, LINE.replace(":7447", ""), ":3: hosts.head: the others must know where to call; add a port: head: 127"),
+        (LINE, LINE.replace("127.0.0.1:7447", "0.0.0.0:7447"), ":3: hosts.head: nobody can call 0.0.0.0"),
+        (LINE, LINE.replace("7447", "74470"), ":3: hosts.head: 74470 is no port"),
+        (LINE, LINE.replace("head: 127.0.0.1:7447", "head: 'tcp/127.0.0.1:7447'"), ":3: hosts.head: .* is no address"),
+        (LINE, LINE.replace("head:", "Head:"), ":3: hosts.Head: a host's name is lower case"),
+        (LINE, f"{LINE}\nrouter: worker1", ":4: router: 'worker1' is not the head; valid: head, or ADDRESS:PORT"),
+        (LINE, f"{LINE}\nrouter: 127.0.0.1", ":4: router: the port is missing"),
+        (LINE, "hosts: [head]", ":3: hosts: Expected `object "),
+        (PLACED, "host: wrker1", ":12: stages.worker.host: no host 'wrker1'; did you mean 'worker1'"),
+        (PLACED, "host: {worker1: 0}", ":12: stages.worker.host"),
+        (PLACED, f"{PLACED}\n    replicas: 3", ":13: stages.worker.replicas: 3, but host places 2"),
+        (
+            PLACED,
+            f"{PLACED}\n    replicas: auto",
+            ":13: stages.worker.replicas: the cores of worker1 are not known here",
+        ),
+        ("host: worker2", "host: {worker1: 1, worker2: 1}", ":18: stages.gatherer.host: .* takes no Part"),
+    ],
+)
+def test_what_cannot_work_or_is_not_safe_is_one_line(tmp_path: Path, old: str, new: str, message: str):
+    with pytest.raises(Refused, match=message) as caught:
+        load(tmp_path, old=old, new=new)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_address_that_was_set_is_refused_where_it_was_set(tmp_path: Path):
+    with pytest.raises(Refused, match=f"--set hosts.worker1: 10.0.0.2 {OPEN}"):
+        load(tmp_path, "hosts.worker1=10.0.0.2")
+
+
+def test_keys_say_nothing_without_hosts():
+    with pytest.raises(Refused, match="keys: says nothing without hosts"):
+        layout(keys="keys")
+
+
+def test_with_keys_every_endpoint_is_tls(tmp_path: Path):
+    made = layout(hosts={"head": "10.0.0.1:7447", "worker1": "[fe80::2]"}, keys="keys")
+    assert (made.endpoint, made.keys) == ("tls/10.0.0.1:7447", Path("/lab/keys"))
+    assert made.network("worker1", None).listen == "tls/[fe80::2]:0"
+    assert not made.network("worker1", None).routed
+
+
+def test_a_router_is_where_all_meet():
+    hosts = {"head": "127.0.0.1:7447", "worker1": "127.0.0.1"}
+    assert layout(hosts=hosts, router="head").endpoint == "tcp/127.0.0.1:7447"
+    elsewhere = layout(hosts={**hosts, "head": "127.0.0.1"}, router="127.0.0.1:9000")
+    assert (elsewhere.endpoint, elsewhere.router_is_head) == ("tcp/127.0.0.1:9000", False)
+    assert elsewhere.network("worker1", None).hosts == ("head", "worker1", "router")
+
+
+def test_owners_of_keys_come_from_a_graph_or_the_command_line(tmp_path: Path):
+    path = tmp_path / "graph.yaml"
+    path.write_text(HOSTS.read_text().replace(LINE, LINE.replace("worker1: 127.0.0.1", "worker1: 10.0.0.2")))
+    read, folder = read_owners([str(path)])
+    assert (read.names, folder) == (("head", "worker1", "worker2"), tmp_path / "keys")
+    assert read_owners(["head=10.0.0.1", "arm=lab.local"])[0].hosts == (
+        Host("head", "10.0.0.1"),
+        Host("arm", "lab.local"),
+    )
+    with pytest.raises(Refused, match="expected one graph file, or hosts as NAME=ADDRESS"):
+        read_owners(["head=10.0.0.1", "arm"])
+
+
+# ---------------------------------------------------------------------------------------------- between hosts
+
+
+def test_two_graph_files_are_compared_key_by_key():
+    own = read_document(HOSTS).values
+    theirs = {**own, "seed": 8, "view": "x:Y", "stages": {**own["stages"], "sink": {}}}
+    assert {key for key, _, _ in differences(own, theirs)} == {
+        "seed",
+        "view",
+        "stages.sink.stage",
+        "stages.sink.config",
+        "stages.sink.inputs",
+    }
+    assert list(differences(own, own)) == []
+
+
+def test_paths_of_the_head_become_paths_of_the_host():
+    entry = {"config": {"catalogue": "/lab/head/stages/x.yaml", "data": ["/data/ycb", "/lab/headless"], "n": 3}}
+    assert moved(entry, {"/lab/head": "/home/a"}) == {
+        "config": {"catalogue": "/home/a/stages/x.yaml", "data": ["/data/ycb", "/lab/headless"], "n": 3}
+    }
+
+
+def test_two_graphs_on_one_machine_never_meet():
+    """Not even where both have the same run id and the same keys."""
+    heard: dict[str, list[bytes]] = {"one": [], "two": []}
+    buses: list[Bus] = []
+    for name, packets in heard.items():
+        endpoint = free_endpoint()
+        listener, speaker = Bus("same", listen=endpoint), Bus("same", connect=endpoint)
+        listener.subscribe("**", lambda packet, packets=packets: packets.append(packet.payload))
+        buses += [speaker, listener]
+        deadline = time.monotonic() + 30
+        while not packets and time.monotonic() < deadline:
+            speaker.publish("m/counter/number", name.encode())
+            time.sleep(0.02)
+    for speaker, text in zip(buses[::2], ("one", "two"), strict=True):
+        speaker.publish("m/counter/last", text.encode())
+    time.sleep(0.3)
+    for session in buses:
+        session.close()
+    assert {name: set(packets) for name, packets in heard.items()} == {"one": {b"one"}, "two": {b"two"}}
+
+
+def test_times_of_another_clock_are_not_taken():
+    for clock, sent_ns in ((bus._CLOCK, 5), (bus._CLOCK ^ 1, 0)):
+        sample = SimpleNamespace(attachment=zenoh.ZBytes(bus._SENT.pack(5, clock, b"12345678")))
+        assert bus._attached(cast("zenoh.Sample", sample)) == (sent_ns, b"12345678")
+
+
+# ---------------------------------------------------------------------------------------------- who is cut off
+
+
+def envelope(number: int) -> Envelope:
+    return Envelope(f"a.piece#{number}", f"a.piece#{number}", 0, "Piece", 1, (), msgspec.Raw(b"\xc0"))
+
+
+def test_an_old_process_that_is_seen_again_takes_nothing_from_its_successor():
+    sent: list[str] = []
+    route = Route("piece", "worker", "piece", "block", 8, shared=True, kept=False)
+    delivery = Delivery([route], lambda path, _: sent.append(path), print, lambda: False)
+    old, new = Process("worker", 0, 0), Process("worker", 0, 1)
+    delivery.update(old, True)
+    delivery.publish("piece", envelope(0), b"")
+    delivery.update(new, True)
+    assert sent == ["d/worker/0/piece"] * 2  # the old one was cut off with it
+    for present in (False, True, False):
+        delivery.update(old, present)
+    delivery.publish("piece", envelope(1), b"")
+    assert sent == ["d/worker/0/piece"] * 3
+
+
+def test_a_replica_is_there_while_one_of_its_processes_is():
+    presence = Presence()
+    for process, present in ((Process("worker", 0, 0), True), (Process("worker", 0, 1), True)):
+        presence.update(process, present)
+    presence.update(Process("worker", 0, 0), False)
+    assert presence.wait_for([("worker", 0)], lambda: True)
