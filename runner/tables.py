@@ -114,7 +114,7 @@ def _times(headers: Sequence[Header]) -> list[int]:
 
 def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> None:
     """Prints log lines as they come, with the time since the start of the run."""
-    terminal, began = Terminal(), _began(recording)
+    terminal, began = Terminal(sys.stdout), _began(recording)
     spoken: set[str] = set()
     for line in lines:
         spoken.add(line.stage)
@@ -160,7 +160,7 @@ def _command_lines(command: CommandType) -> Iterator[str]:
 
 def show_progress(id: str, stage: str, news: Iterable[Progress]) -> int:
     """Prints what the stage says while it does what it was called for, then its answer; returns the exit status."""
-    terminal = Terminal()
+    terminal = Terminal(sys.stdout)
     for progress in news:
         for level, text in progress.lines:
             terminal.show(stage, text, level)

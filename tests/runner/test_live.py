@@ -28,6 +28,7 @@ from runner.graph import load_graph
 from runner.live import Live
 from runner.recording import Recording
 from runner.registry import Entry, Registration, find_run, runs
+from runner.tables import show_progress
 from tests.runner.test_runs import DOUBLES, HERE, finish, read_until
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
@@ -258,6 +259,16 @@ def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> 
     with Live(account.entry) as live:
         os.kill(account.pid_of("account"), signal.SIGKILL)
         assert call(live, "add", amount="5").lines == (("info", "5 added"),)
+
+
+def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixture[str]) -> None:
+    def answered(success: bool) -> int:
+        body = msgspec.Raw(msgspec.msgpack.encode({"success": success, "relations": [{"n": n} for n in range(40)]}))
+        answer = pack(Envelope("account.sum#0", "account.sum#0", 1, "Sum", 1, (), body))
+        return show_progress("supervisor.account_add#0", "account", [Progress((), True, answer=answer)])
+
+    assert [answered(True), answered(False)] == [0, 1]
+    assert "lines more" in capsys.readouterr().out
 
 
 # ------------------------------------------------------------------------------------------ restart
