@@ -6,7 +6,7 @@ SET ?=
 export PYOPENGL_PLATFORM ?= egl
 export PYGLET_HEADLESS ?= 1
 
-.PHONY: help setup system up test lint fast bench clean
+.PHONY: help setup system up test lint fast bench reference clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -40,6 +40,12 @@ fast: setup  ## the fast tests only
 
 bench: setup  ## speed of the kernel
 	$(BIN)/python -m benchmarks.kernel
+
+reference: setup  ## record recordings/reference.mcap again: one small image through all of perception
+	rm -rf build/reference build/reference-* recordings/reference.mcap
+	$(BIN)/python -m benchmarks.clutter build/reference --scenes 1 --seed 5
+	$(BIN)/runner up graphs/reference.yaml --recordings build
+	$(BIN)/runner recover build/reference-*.mcap recordings/reference.mcap
 
 clean:
 	rm -rf .venv build .pytest_cache .ruff_cache

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import msgspec
+import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import Frame, LookRequest, Snapshot
@@ -66,29 +67,33 @@ class DatasetCamera(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """A BOP data set folder; at most ``limit`` images (0: all)."""
+        """A BOP data set folder; at most ``limit`` images (0: all), of which every ``stride``-th row and column."""
 
         dataset: Path
         limit: int = 0
+        stride: int = 1
 
         def __post_init__(self) -> None:
             if self.limit < 0:
                 raise Refused(f"camera.limit = {self.limit}: must be 0 (all images) or more")
+            if self.stride < 1:
+                raise Refused(f"camera.stride = {self.stride}: must be 1 (all pixels) or more")
 
     def __init__(self, config: Config) -> None:
         from stages.devices.bop import read_dataset
 
         images = read_dataset(config.dataset)
         self._images = images[: config.limit or len(images)]
+        self._stride = config.stride
 
     def source(self, ctx: Context) -> Iterator[Frame]:
         """The images in the order of the targets file."""
         for index, image in enumerate(self._images):
-            rgb, depth = image.read()
+            rgb, depth = (pixels[:: self._stride, :: self._stride] for pixels in image.read())
             yield Frame(
                 rgb=rgb,
                 depth=depth,
-                K=image.K,
+                K=np.diag([1 / self._stride, 1 / self._stride, 1.0]) @ image.K,
                 T_base_camera=None,
                 robot_mask=None,
                 name=f"{image.scene_id:06d}/{image.image_id:06d}",

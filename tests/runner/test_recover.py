@@ -132,8 +132,8 @@ def publish_until_killed(session: Session, kill: Callable[[], None], seconds: fl
 def lost_ns(path: Path, topic: str, killed: int) -> int:
     """Time before the kill of which nothing is left; what is there must be without a gap."""
     recording = Recording(path)
-    assert recording.torn
-    assert "INCOMPLETE: torn at byte" in str(recording.verdict)
+    assert not recording.verdict.complete
+    assert ("INCOMPLETE: torn at byte" in str(recording.verdict)) == recording.torn
     found = [recording.envelope(id) for id, message in recording.messages.items() if message.topic == topic]
     assert [sealed.id for sealed in found] == [f"{topic.replace('/', '.')}#{number}" for number in range(len(found))]
     recovered, target = recover(path, path.with_name(f"{killed}.mcap"))

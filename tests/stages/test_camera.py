@@ -80,9 +80,22 @@ def test_data_set_camera_stops_at_its_limit() -> None:
     assert [frame.total for frame in camera.source(context())] == [2, 2]
 
 
-def test_negative_limit_is_refused() -> None:
-    with pytest.raises(Refused, match=r"camera\.limit = -1"):
-        DatasetCamera.Config(dataset=Path(), limit=-1)
+@needs_data
+def test_a_stride_keeps_pixels_and_where_they_look() -> None:
+    whole, thinned = (
+        next(DatasetCamera(DatasetCamera.Config(dataset=DATA / "ycb-real", stride=stride)).source(context()))
+        for stride in (1, 2)
+    )
+    codec.encode(thinned)
+    assert np.array_equal(thinned.rgb, whole.rgb[::2, ::2])
+    ray, same = (np.linalg.inv(frame.K) @ (*pixel, 1) for frame, pixel in ((whole, (200, 100)), (thinned, (100, 50))))
+    assert np.allclose(ray, same)
+
+
+@pytest.mark.parametrize(("name", "value"), [("limit", -1), ("stride", 0)])
+def test_limits_that_mean_nothing_are_refused(name: str, value: int) -> None:
+    with pytest.raises(Refused, match=rf"camera\.{name} = {value}"):
+        DatasetCamera.Config(dataset=Path(), **{name: value})
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pyrealsense2") is not None, reason="pyrealsense2 is installed")
