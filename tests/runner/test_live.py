@@ -350,7 +350,9 @@ def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
         seen = live.status().published
         assert call(live, "collect", count="20").done
         assert live.status().published != seen
-    tool.kill()
+    tool.send_signal(signal.SIGCONT)
+    tool.send_signal(signal.SIGINT)
+    assert tool.wait(30) == 130
     tool.communicate()
 
 
