@@ -88,11 +88,12 @@ class DatasetCamera(Stage):
 
     def source(self, ctx: Context) -> Iterator[Frame]:
         """The images in the order of the targets file."""
+        kept = slice(None, None, self._stride)
         for index, image in enumerate(self._images):
-            rgb, depth = (pixels[:: self._stride, :: self._stride] for pixels in image.read())
+            rgb, depth = image.read()
             yield Frame(
-                rgb=rgb,
-                depth=depth,
+                rgb=rgb[kept, kept],
+                depth=depth[kept, kept],
                 K=np.diag([1 / self._stride, 1 / self._stride, 1.0]) @ image.K,
                 T_base_camera=None,
                 robot_mask=None,
