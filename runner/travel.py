@@ -166,7 +166,6 @@ class Traveller:
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
             return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
-        self._log.clear()
         stage, executions = self._life(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
@@ -193,8 +192,14 @@ class Traveller:
             again = Reenactment(
                 self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
             )
-            self._lives[life] = again.stage, (done for one in steps for done in again.take(one))
+            self._lives[life] = again.stage, self._executions(again, steps)
         return self._lives[life]
+
+    def _executions(self, again: Reenactment, steps: Sequence[Step]) -> Iterator[Execution]:
+        """All steps of a process, message by message; the log is that of the step at hand."""
+        for step in steps:
+            self._log.clear()
+            yield from again.take(step)
 
     def _note_log(self, text: str, level: str) -> None:
         self._log.append(f"{level} of the stage: {text}")
