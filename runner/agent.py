@@ -20,6 +20,7 @@ from runner.children import last_lines, signal_group, spawn
 from runner.contract import Refused
 from runner.document import Document
 from runner.hosts import (
+    PIECE_BYTES,
     Dismiss,
     Ended,
     Hello,
@@ -132,12 +133,22 @@ class Agent:
             with contextlib.suppress(queue.Empty):
                 match self._events.get(timeout=TICK_SECONDS):
                     case Start() as order:
-                        report = self._start(order, folder)
+                        report = self._start(self._with_past(bus, order, folder), folder)
                         bus.publish(f"report/{self._host}/{self._session}", msgspec.json.encode(report))
                     case Signal() as order:
                         self._signal(order)
                     case end:
                         return end
+
+    def _with_past(self, bus: Bus, order: Start, folder: Path) -> Start:
+        """Copies the recording here from which a stage gets its state back."""
+        if not order.task.past:
+            return order
+        path = (folder / f"{order.process.stage}-past.mcap").absolute()
+        with path.open("wb") as file:
+            while file.write(bus.ask("past", str(file.tell()).encode(), ASK_SECONDS)) == PIECE_BYTES:
+                pass
+        return msgspec.structs.replace(order, task=msgspec.structs.replace(order.task, past=str(path)))
 
     def _start(self, order: Start, folder: Path) -> Report:
         process = order.process

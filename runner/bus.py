@@ -349,11 +349,13 @@ class Presence:
         return True
 
 
-def free_endpoint() -> str:
-    """A loopback endpoint that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
+    """An endpoint that nothing listens on, on loopback or with the protocol and address of another one."""
+    address = like.partition("/")[2].rpartition(":")[0]
+    family, *_, bare = socket.getaddrinfo(address.strip("[]"), 0, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family) as probe:
+        probe.bind(bare)
+        return f"{like.rpartition(':')[0]}:{probe.getsockname()[1]}"
 
 
 def _reply(query: zenoh.Query, key: str, badge: bytes, answer: Callable[[bytes], bytes]) -> None:

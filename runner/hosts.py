@@ -4,6 +4,7 @@ Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learn
 
 ==========================  ======================================================================================
 ``q/join``                  a host's question (:class:`Hello`), answered with :class:`Welcome` or the reason why not
+``q/past``                  the recording so far, from an offset on: what a stateful stage lived before a restart
 ``order/HOST/SESSION``      what the host is to do (:data:`Order`); only the head may publish here
 ``report/HOST/SESSION``     what has come of it (:data:`Report`)
 ``present/HOST/0/SESSION``  liveliness of the host, of the head too; a host without it is cut off
@@ -23,7 +24,7 @@ from typing import Any, cast
 
 import msgspec
 
-from runner.bus import Bus, Packet, Process, Router
+from runner.bus import Bus, Packet, Process, Router, free_endpoint
 from runner.contract import Level, Refused
 from runner.document import Document, read_document, suggest
 from runner.host import Assignment
@@ -39,6 +40,8 @@ LEAVE_SECONDS = 3.0
 CUT_OFF = 1
 """Stands for the exit code of a process that nobody hears of any more."""
 SHOWN_DIFFERENCES = 5
+PIECE_BYTES = 4 * 2**20
+"""Of a recording that a host reads, at a time."""
 _MISSING = "nothing"
 
 
@@ -186,9 +189,14 @@ class Hosts:
         listen = None if network.routed else self.endpoint
         self._bus = Bus(control(name), listen=listen, connect=None if listen else self.endpoint, network=network)
 
-    def open(self, run: str) -> None:
-        """Lets hosts join a run."""
+    def listen(self) -> str | None:
+        """An endpoint for the head's own session of the run; None where it meets the others at a router."""
+        return None if self.network.routed else free_endpoint(self.network.listen)
+
+    def open(self, run: str, recording: Path) -> None:
+        """Lets hosts join a run, and read what has been recorded of it."""
         self._run = run
+        self._bus.serve("past", lambda offset: _read(recording, int(offset)))
         self._bus.subscribe("report/*/*", self._on_report)
         self._bus.watch(self._on_presence)
         self._bus.serve("join", lambda text: msgspec.json.encode(self._join(msgspec.json.decode(text, type=Hello))))
@@ -383,6 +391,12 @@ def moved(value: Any, folders: Mapping[str, str]) -> Any:
             return [moved(inner, folders) for inner in cast("list[Any]", value)]
         case _:
             return value
+
+
+def _read(file: Path, offset: int) -> bytes:
+    with file.open("rb") as opened:
+        opened.seek(offset)
+        return opened.read(PIECE_BYTES)
 
 
 def _short(value: Any) -> str:

@@ -35,6 +35,7 @@ from runner.ports import port_name
 from runner.recorder import Manifest, topic
 from runner.refusals import Refusals, admit, require_genuine
 from runner.registry import Entry, Registration, runs
+from runner.shared_memory import sweep
 from runner.status import ProcessStatus, Rates, RunStatus, topics_of
 from runner.step import sequence_of
 from runner.terminal import Terminal
@@ -135,12 +136,12 @@ class Supervisor:
         self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._network = self._hosts.network if self._hosts else None
         self._endpoint = self._hosts.endpoint if self._hosts else free_endpoint()
-        listen, connect = (None, self._endpoint) if self._hosts else (self._endpoint, None)
+        listen, connect = (self._hosts.listen(), self._endpoint) if self._hosts else (self._endpoint, None)
         self._secret = secrets.token_hex(16)
         self._bus = Bus(self._run, listen=listen, connect=connect, network=self._network, secret=self._secret)
         self._entry = Entry(
             run=self._run,
-            endpoint=self._endpoint,
+            endpoint=listen or self._endpoint,
             pid=os.getpid(),
             graph=str(file.absolute()),
             recording=str(self.recording.absolute()),
@@ -174,6 +175,7 @@ class Supervisor:
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
+        sweep()
         self._connect()
         self._terminal.show(SUPERVISOR, f"run {self._run} on {self._endpoint}")
         try:
@@ -181,7 +183,7 @@ class Supervisor:
             if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
                 self._viewer = self._start_viewer()
             if self._hosts is not None:
-                self._hosts.open(self._run)
+                self._hosts.open(self._run, self.recording)
             for stage, replica in self._graph.processes():
                 self._children[stage, replica] = self._start(Process(stage, replica))
             end = self._watch()
@@ -381,6 +383,7 @@ class Supervisor:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):
             child.condemned, child.dies_at = fault, now + DUMP_SECONDS
+            self._say(f"{name} is killed: {fault}", "warning")
             child.handle.send_signal(DUMP)
         if now > min(child.dies_at, child.retires_by or child.dies_at):
             signal_group(child.handle, signal.SIGKILL)
@@ -444,6 +447,7 @@ class Supervisor:
         last = [child for child in (self._recorder, self._viewer) if child is not None]
         _end_all(last, RECORDER_GRACE_SECONDS)
         self._bus.close()
+        sweep()
         self._registration.close()
         return "" if self._recorder is None else self._recorder.reason()
 
