@@ -29,12 +29,11 @@ from runner.live import Live
 from runner.recording import Recording
 from runner.registry import Entry, Registration, find_run, runs
 from runner.tables import show_progress
-from tests.runner.test_runs import DOUBLES, HERE, finish, read_until
+from tests.runner.test_runs import HERE, TOYS, finish, read_until
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
 
 ACCOUNT = HERE / "account.yaml"
-ENDLESS = ("counter.count=1000000", "counter.period=0.02", "sink.count=1000000")
 
 
 class Run:
@@ -63,10 +62,6 @@ class Run:
         if self.process.stdout is not None and not self.process.stdout.closed:
             self.process.terminate()
             self.finish()
-
-
-def sink(folder: Path) -> str:
-    return f"sink.path={folder / 'out.txt'}"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -275,28 +270,24 @@ def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixtu
 
 
 def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) -> None:
-    run = Run(
-        tmp_path,
-        DOUBLES,
-        sink(tmp_path),
-        "counter.count=100",
-        "counter.period=0.03",
-        "sink.count=100",
-        "doubler.restarts=0",
-    )
+    settings = ("counter.count=60", "counter.period=0.05", "worker.seconds=0.02", "worker.restarts=0")
+    run = Run(tmp_path, TOYS, f"sink.path={tmp_path / 'out.txt'}", *settings)
     with Live(run.entry) as live:
-        with pytest.raises(Refused, match=r"no process 'dubler'; did you mean 'doubler'"):
-            live.restart("dubler")
+        with pytest.raises(Refused, match=r"no process 'worker'; did you mean 'worker.1'"):
+            live.restart("worker")
         wait_for((tmp_path / "out.txt").exists)
-        assert re.fullmatch(r"doubler is back: process \d+, ready after \d+\.\d s", live.restart("doubler"))
-        doubler = next(process for process in live.status().processes if process.stage == "doubler")
-        assert (doubler.restarts, doubler.reason) == (1, "asked to restart")
+        assert re.fullmatch(r"worker.1 is back: process \d+, ready after \d+\.\d s", live.restart("worker.1"))
+        worker = next(process for process in live.status().processes if process.name == "worker.1")
+        assert (worker.restarts, worker.reason) == (1, "asked to restart")
     finished = run.finish()
-    assert finished.code == 0, finished.output
-    assert finished.result == [str(2 * value) for value in range(100)]
-    steps = [step for step in Recording(finished.recording).steps if step.stage == "doubler"]
+    assert (finished.code, len(finished.result)) == (0, 60), finished.output
+    recording = Recording(finished.recording)
+    assert recording.verdict.complete
+    steps = [step for step in recording.steps if step.stage == "worker"]
     assert {step.outcome for step in steps} == {"done"}
-    assert {step.incarnation for step in steps} == {0, 1}
+    assert {step.incarnation for step in steps if step.replica == 1} == {0, 1}
+    pieces = [id for step in steps for port, id in step.consumed if port == "piece"]
+    assert len(pieces) == len(set(pieces)) == 240
 
 
 # ------------------------------------------------------------------------------------------ as a user types it
