@@ -236,7 +236,7 @@ def _estimated(path: Path, kind: tuple[str, str], wanted: range, processes: int)
     for image, estimate in zip(chosen, estimates(dataset, chosen, Settings(processes=processes)), strict=True):
         done.append(recorder.scene(image, kind, estimate))
         with path.open("a") as file:
-            file.write(msgspec.json.encode(done[-1]).decode() + "\n")
+            file.write(msgspec.json.encode(done[-1], enc_hook=np.generic.item).decode() + "\n")
         wrong = sum(not item.right for item in done[-1].instances)
         print(f"{path.stem} {image.frame.name}: {wrong} of {len(done[-1].instances)} wrong", flush=True)
     return done
