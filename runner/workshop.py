@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
-from runner.children import ENVIRONMENT, die_with_parent, ending, last_lines
+from runner.children import ENVIRONMENT, PARENT, die_with_parent, ending, last_lines
 
 T = TypeVar("T")
 
@@ -26,12 +26,8 @@ STOP_SECONDS = 5.0
 def clean_command(module: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
     """Command and environment of an interpreter in which libraries compute on one thread."""
     paths = os.pathsep.join(path for path in sys.path if path)
-    return [sys.executable, "-m", module, *arguments], {
-        **os.environ,
-        **ENVIRONMENT,
-        "PYTHONUNBUFFERED": "1",
-        "PYTHONPATH": paths,
-    }
+    own = {PARENT: str(os.getpid()), "PYTHONUNBUFFERED": "1", "PYTHONPATH": paths}
+    return [sys.executable, "-m", module, *arguments], {**os.environ, **ENVIRONMENT, **own}
 
 
 def is_clean() -> bool:
@@ -48,7 +44,7 @@ class Forked:
         log.touch()
         ours, theirs = _FORK.Pipe()
         self.connection = ours
-        self._process = _FORK.Process(target=_run, args=(work, theirs, log), daemon=True)
+        self._process = _FORK.Process(target=_run, args=(work, theirs, log, os.getpid()), daemon=True)
         sys.stdout.flush()
         self._process.start()
         theirs.close()
@@ -70,7 +66,8 @@ class Forked:
         self._process.join()
 
 
-def _run(work: Callable[[Connection], None], connection: Connection, log: Path) -> None:
+def _run(work: Callable[[Connection], None], connection: Connection, log: Path, parent: int) -> None:
+    os.environ[PARENT] = str(parent)
     die_with_parent()
     with log.open("ab") as output:
         os.dup2(output.fileno(), 1)

@@ -1,6 +1,7 @@
 """Commands that execute a recording again: ``replay``."""
 
 import argparse
+import os
 import subprocess
 
 from runner.commands import Command, Commands, add, add_file, add_settings
@@ -60,13 +61,15 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
     """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
-    from runner.children import die_with_parent
+    from runner.children import PARENT, die_with_parent
     from runner.workshop import clean_command, is_clean
 
     if is_clean():
+        if PARENT in os.environ:
+            die_with_parent()
         return command(options)
     arguments, environment = clean_command("runner.cli", *options.arguments)
-    return subprocess.call(arguments, env=environment, preexec_fn=die_with_parent)
+    return subprocess.call(arguments, env=environment)
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.children import SINGLE_THREADED
+from runner.children import ENVIRONMENT
 from runner.cli import main
 from tests.runner.recordings import record_toys
 
@@ -20,7 +20,7 @@ def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is forked here: this process will do."""
-    for name, value in SINGLE_THREADED.items():
+    for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
 
 

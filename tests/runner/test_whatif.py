@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.children import SINGLE_THREADED
+from runner.children import ENVIRONMENT
 from runner.cli import main
 from runner.codec import decode
 from runner.contract import Message
@@ -133,7 +133,7 @@ def test_another_seed_executes_everything(toys: Path):
 def test_what_is_impossible_is_refused_with_what_is_valid(
     toys: Path, arguments: list[str], error: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    for name, value in SINGLE_THREADED.items():
+    for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)  # nothing is executed: this process will do
     assert main(["replay", str(toys), *arguments]) == 2
     assert error in capsys.readouterr().err
