@@ -27,6 +27,7 @@ from runner.network import Network
 from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording import JOURNAL, LOG, PROFILE, RUN, VERDICT, Ledger, Verdict, replicated, split_id, topic_of
 from runner.refusals import Refusals
+from runner.shared_memory import YOUNG_SECONDS, sweep
 from runner.tap import Tap
 
 FLUSH_SECONDS = 0.25
@@ -321,13 +322,17 @@ class Recorder:
         self._bus.announce(Process(RECORDER, 0))
         self._heart.start()
         self._stopping.wait()
-        if is_orphan():
+        if self._is_left_alone():
             self._outlive()
         self._heart.stop()
         self._echoes.put(None)
         self._echo.join(FLUSH_SECONDS)
         self._bus.close()
-        return self._writer.close()
+        verdict = self._writer.close()
+        if is_orphan():  # nobody else is left to tidy up
+            time.sleep(YOUNG_SECONDS)
+            sweep()
+        return verdict
 
     def stop(self) -> None:
         """Ends :meth:`run` after what has arrived. May be called from a signal handler."""
@@ -336,6 +341,14 @@ class Recorder:
     def _on_message(self, packet: Packet) -> None:
         if self._take(Envelope, packet):
             self._tap.pass_on(packet)
+
+    def _is_left_alone(self) -> bool:
+        """Whether the supervisor has died. It ends stages before the recorder: with some left, the kernel may just
+        be about to say so."""
+        deadline = time.monotonic() + ORPHANED_SECONDS / 5
+        while self._present and not is_orphan() and time.monotonic() < deadline:
+            time.sleep(FLUSH_SECONDS / 25)
+        return is_orphan()
 
     def _outlive(self) -> None:
         """The stages die with the supervisor; what they have said until then is recorded."""

@@ -1,0 +1,247 @@
+"""What goes wrong is found, explained and repaired, and changes no byte of what a graph answers."""
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from runner.recording import Recording
+from tests.runner.test_replay import verify
+from tests.runner.test_runs import DOUBLES, HERE, TOYS, Run, finish, processes_of, read_until, run, start
+
+ALBUM = HERE / "album.yaml"
+ENDLESS = ("counter.count=100000", "counter.period=0.005", "sink.count=100000")
+
+
+def changed(source: Path, folder: Path, **changes: str) -> Path:
+    """A graph file with the classes of some stages replaced: ``Worker="Troubled"``."""
+    text = source.read_text()
+    for old, new in changes.items():
+        assert f"toys:{old}" in text
+        text = text.replace(f"tests.runner.toys:{old}", f"tests.runner.survivors:{new}")
+    path = folder / source.name
+    path.write_text(text)
+    return path
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def pid_of(folder: Path, name: str) -> int:
+    """The process that writes to a log of this run, for example ``doubler-0``."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            target = (entry / "fd/1").readlink()
+        except OSError:
+            continue
+        if folder in target.parents and target.name == f"{name}.txt":
+            return int(entry.name)
+    raise AssertionError(f"no process writes {name}.txt")
+
+
+def bodies(one: Run) -> dict[str, bytes]:
+    return {envelope.id: bytes(envelope.body) for envelope in Recording(one.recording).envelopes()}
+
+
+def test_every_trouble_is_explained_and_changes_no_byte(tmp_path: Path):
+    calm, rough = tmp_path / "calm", tmp_path / "rough"
+    calm.mkdir()
+    rough.mkdir()
+    undisturbed = run(TOYS, calm)
+    troubles = [f"worker.{trouble}_at={at}" for at, trouble in enumerate(("crash", "kill", "stop", "loop", "grow"))]
+    limits = ("worker.heartbeat=4", "worker.timeout=6", "worker.memory=0.3GB", "worker.restarts=9")
+    disturbed = run(changed(TOYS, rough, Worker="Troubled"), rough, f"worker.marks={rough}", *troubles, *limits)
+    assert (disturbed.code, disturbed.result) == (0, undisturbed.result), disturbed.output
+    for reason in (
+        r"killed by SIGSEGV",
+        r"killed by SIGKILL",
+        r"hung: no sign of life for 4 s \(heartbeat\)",
+        r"hung: on_piece has computed for more than 6 s \(timeout\)",
+        r"out of memory: it holds \d[^,]*, its limit is 0.3GB \(memory\)",
+    ):
+        assert re.search(rf"supervisor +worker\.\d (restarts \(\d of 9\)|is killed): {reason}", disturbed.output), (
+            disturbed.output
+        )
+    assert "| Fatal Python error: Segmentation fault" in disturbed.output
+    assert re.search(r'\| +File ".*survivors.py", line \d+ in loop', disturbed.output)
+    recorded = bodies(disturbed)
+    assert {id: recorded[id] for id in bodies(undisturbed)} == bodies(undisturbed)
+    assert Recording(disturbed.recording).verdict.complete
+    code, said = verify(disturbed.recording)
+    assert code == 0, said
+    assert processes_of(rough) == []
+
+
+def test_a_start_up_that_never_ends_is_ended(tmp_path: Path):
+    graph = changed(DOUBLES, tmp_path, Doubler="NeverReady")
+    graph.write_text(graph.read_text().replace("double: doubler.double", "double: other.double") + OTHER)
+    stuck = run(graph, tmp_path, "doubler.startup=10")
+    assert stuck.code == 1
+    assert stuck.output.splitlines()[-1] == "doubler failed at start-up: start-up hung: not ready after 10 s (startup)"
+    assert "| loading the weights" in stuck.output
+    assert processes_of(tmp_path) == []
+
+
+OTHER = """
+  other:
+    stage: tests.runner.toys:Doubler
+    inputs: {number: counter.number}
+"""
+
+
+def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
+    silent = run(changed(TOYS, tmp_path, Worker="Troubled"), tmp_path, f"worker.marks={tmp_path}", "worker.exit_at=1")
+    assert silent.code == 0, silent.output
+    assert re.search(r"worker\.\d restarts \(1 of 3\): ended with exit code 3", silent.output)
+
+
+def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
+    calm, rough = tmp_path / "calm", tmp_path / "rough"
+    calm.mkdir()
+    rough.mkdir()
+    undisturbed = run(changed(DOUBLES, calm, Doubler="Adder"), calm, f"doubler.marks={calm}")
+    disturbed = run(changed(DOUBLES, rough, Doubler="Adder"), rough, f"doubler.marks={rough}", "doubler.die_at=[2, 4]")
+    assert (disturbed.code, disturbed.result) == (0, undisturbed.result), disturbed.output
+    assert disturbed.output.count("restarts (") == 2
+    assert all(body == bodies(undisturbed)[id] for id, body in bodies(disturbed).items() if "double" in id)
+    code, said = verify(disturbed.recording)
+    assert code == 0, said
+
+
+# ------------------------------------------------------------------------------------ back-pressure
+
+
+def test_a_consumer_that_stands_still_for_longer_than_five_seconds_loses_nothing(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, "counter.count=60", "counter.period=0.02", "sink.count=60")
+    before = read_until(process, "processes are ready")
+    doubler = pid_of(tmp_path, "doubler-0")
+    os.kill(doubler, signal.SIGSTOP)
+    time.sleep(6.5)
+    os.kill(doubler, signal.SIGCONT)
+    ended = finish(process, tmp_path, before)
+    assert (ended.code, ended.result) == (0, [str(2 * number) for number in range(60)]), ended.output
+    assert re.search(r"supervisor +doubler is slow: no sign of life for 5", ended.output), ended.output
+    assert re.search(r"supervisor +doubler goes on after [67]", ended.output), ended.output
+    assert "restarts (" not in ended.output
+    assert Recording(ended.recording).verdict.complete
+
+
+def test_whoever_wants_the_latest_holds_nobody_up(tmp_path: Path):
+    process = start(ALBUM, tmp_path, f"camera.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    glance = pid_of(tmp_path, "glance-0")
+    os.kill(glance, signal.SIGSTOP)
+    (tmp_path / "go").touch()
+    ended = finish(process, tmp_path, before)
+    assert (ended.code, ended.result) == (0, [str(number) for number in range(60)]), ended.output
+    assert "glance.picture: 60 of 60 messages skipped (policy latest)" in ended.output
+    assert Recording(ended.recording).verdict.complete
+    assert processes_of(tmp_path) == []
+
+
+def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
+    ended = run(ALBUM, tmp_path, "glance.seconds=0.5", "camera.size=100000", "camera.count=200")
+    assert (ended.code, len(ended.result)) == (0, 200), ended.output
+    assert re.search(r"glance.picture: 1\d\d of 200 messages skipped \(policy latest\)", ended.output)
+    recording = Recording(ended.recording)
+    assert recording.verdict.complete
+    seen = [id for step in recording.steps if step.stage == "glance" for _, id in step.consumed]
+    assert seen == sorted(seen, key=lambda id: int(id.partition("#")[2]))
+
+
+# ------------------------------------------------------------------------------------ shutdown
+
+
+def shared_memory_of(folder: Path) -> set[Path]:
+    """Files of shared memory that processes of a run have mapped."""
+    found: set[Path] = set()
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if str(folder) in str((entry / "fd/1").readlink()):
+                found |= set(map(Path, re.findall(r"/dev/shm/\S+", (entry / "maps").read_text())))
+        except OSError:
+            continue
+    return found
+
+
+def test_a_dying_terminal_ends_the_graph_in_order(tmp_path: Path):
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "runner.cli", "up", str(DOUBLES), "--recordings", str(tmp_path)]
+    command += [part for setting in (f"sink.path={tmp_path / 'out.txt'}", *ENDLESS) for part in ("--set", setting)]
+    script = "import fcntl, os, signal, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+    script += "signal.signal(signal.SIGHUP, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *command], stdin=slave, stdout=slave, stderr=slave, start_new_session=True
+    )
+    os.close(slave)
+    seen = b""
+    while b"processes are ready" not in seen:
+        seen += os.read(master, 4096)
+    mapped = shared_memory_of(tmp_path)
+    os.close(master)
+    assert process.wait(60) == 128 + signal.SIGHUP
+    assert Recording(next(tmp_path.glob("*.mcap"))).verdict.complete
+    assert processes_of(tmp_path) == []
+    assert not [path for path in mapped if path.exists()]
+
+
+def test_a_recorder_outlives_its_supervisor_to_say_so(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, *ENDLESS)
+    read_until(process, "processes are ready")
+    recording = next(tmp_path.glob("*.mcap"))
+    wait_until((tmp_path / "out.txt").exists)
+    mapped = shared_memory_of(tmp_path)
+    process.kill()
+    process.communicate()
+    wait_until(lambda: processes_of(tmp_path) == [])
+    verdict = Recording(recording).verdict
+    assert not verdict.complete
+    assert verdict.reason == "the supervisor died"
+    assert verdict.missing == ()
+    assert not [path for path in mapped if path.exists()]
+
+
+def test_children_that_still_start_die_with_their_supervisor_too(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, *ENDLESS)
+    wait_until(lambda: len(processes_of(tmp_path)) > 0)
+    process.kill()
+    process.communicate()
+    wait_until(lambda: processes_of(tmp_path) == [])
+
+
+def test_a_closed_pipe_does_not_end_the_graph(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, "counter.count=20", "counter.period=0.05", "sink.count=20")
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(60) == 0
+    assert len((tmp_path / "out.txt").read_text().splitlines()) == 20
+    assert Recording(next(tmp_path.glob("*.mcap"))).verdict.complete
+
+
+def test_what_is_bound_to_a_process_dies_with_it():
+    script = "import subprocess, time; from runner.children import bound; "
+    script += "child = subprocess.Popen(bound(['sleep', '600'])); print(child.pid, flush=True); time.sleep(600)"
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    wait_until(lambda: "sleep" in Path(f"/proc/{child}/cmdline").read_text())
+    parent.kill()
+    parent.communicate()
+    wait_until(lambda: not _runs(child))
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
