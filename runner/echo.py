@@ -39,18 +39,25 @@ def _indented(value: Any, indent: str) -> Iterator[str]:
         case list():
             items = cast("list[Any]", value)
             for inner in items[:SHOWN_ITEMS]:
-                yield from _entry(f"{indent}-", inner, indent)
+                first, *more = _item(inner, f"{indent}  ")
+                yield f"{indent}- {first.lstrip()}"
+                yield from more
             if len(items) > SHOWN_ITEMS:
                 yield f"{indent}... and {len(items) - SHOWN_ITEMS} more"
         case _:
             yield f"{indent}{_scalar(value)}"
 
 
+def _item(value: Any, indent: str) -> list[str]:
+    """One item of a list; its first line goes beside the dash."""
+    return list(_indented(value, indent) if _is_nested(value) else _entry("", value, indent))
+
+
 def _entry(head: str, value: Any, indent: str) -> Iterator[str]:
     array = as_array(value)
     if array is not None:
         yield f"{head} {array_text(array)}"
-    elif isinstance(value, dict | list) and value and not _is_flat(cast("Any", value)):
+    elif _is_nested(value):
         yield head
         yield from _indented(value, indent + "  ")
     elif isinstance(value, str) and "\n" in value:
@@ -60,11 +67,13 @@ def _entry(head: str, value: Any, indent: str) -> Iterator[str]:
         yield f"{head} {_scalar(value)}"
 
 
-def _is_flat(value: Any) -> bool:
-    """Short lists of plain values fit on one line."""
-    return (
-        isinstance(value, list) and len(value) <= SHOWN_ELEMENTS and not any(isinstance(v, dict | list) for v in value)
-    )
+def _is_nested(value: Any) -> bool:
+    """What does not fit on one line: short lists of plain values do, and arrays."""
+    if not isinstance(value, dict | list) or not value or as_array(cast("Any", value)) is not None:
+        return False
+    items = cast("list[Any]", value)
+    inner = any(isinstance(item, dict | list) or "\n" in str(item) for item in items)
+    return isinstance(value, dict) or inner or len(items) > SHOWN_ELEMENTS
 
 
 def _scalar(value: Any) -> str:

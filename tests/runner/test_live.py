@@ -397,10 +397,10 @@ def test_any_message_becomes_text() -> None:
         "  mask: bool (20) 3 of 20 true",
         "  names: [cup, jar]",
         "  items:",
-        "    -",
-        "      name: cup",
+        "    - name: cup",
         "      cost: 0.3",
         "  empty: []",
+        "  many:",
     ]
     assert lines[-4:] == ["    ... and 8 more", "  text: |", "      one", "      two"]
     assert next(lines_of(b"\xc1garbage")).startswith("unreadable, 8 B: ")
