@@ -42,10 +42,16 @@ class Terminal:
         colour = _COLOURS[level] if self._colours else ""
         with self._lock:
             try:
-                self._stream.write(f"{colour}{line}{_RESET if colour else ''}\n")
+                self._stream.write(f"{colour}{self._printable(line)}{_RESET if colour else ''}\n")
                 self._stream.flush()
             except OSError:  # the terminal is gone, or the pipe's reader: the recording has it all
                 self._discard()
+
+    def _printable(self, line: str) -> str:
+        """What a stage says must neither break the encoding of the terminal nor steer it."""
+        shown = "".join(one if one.isprintable() else repr(one)[1:-1] for one in line)
+        encoding = self._stream.encoding or "utf-8"
+        return shown.encode(encoding, "backslashreplace").decode(encoding)
 
     def _discard(self) -> None:
         """Sends what is still to be printed nowhere."""
