@@ -25,6 +25,7 @@ class Machines:
     """Where the hosts of the toy graph run, and with which addresses."""
 
     addresses: dict[str, str]
+    """Of the hosts whose addresses are not those of the graph file."""
     spaces: dict[str, str] = field(default_factory=dict)
     """Network namespace by host; empty on loopback."""
 
@@ -33,7 +34,7 @@ class Machines:
 
     def start(self, host: str, folder: Path, *options: str, graph: Path = HOSTS) -> subprocess.Popen[str]:
         """``runner up`` of one host; what it records and logs is in ``folder/HOST``."""
-        inside = ["ip", "netns", "exec", self.spaces[host]] if self.spaces else []
+        inside = _inside(self.spaces[host], folder) if self.spaces else []
         command = [*inside, sys.executable, "-m", "runner.cli", "up", str(graph), "--host", host]
         command += ["--recordings", str(folder / host), *self.settings(), *options]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -69,6 +70,14 @@ def in_namespaces() -> Iterator[Machines]:
                 subprocess.run(["ip", "netns", "del", space], check=False, capture_output=True)
 
 
+def _inside(space: str, folder: Path) -> list[str]:
+    """Runs a command as on another machine: with a network, shared memory and a clock of its own."""
+    clock = folder / f"boot-{space}"
+    clock.write_text(space)
+    mounts = f"mount -t tmpfs none /dev/shm && mount --bind {clock} /proc/sys/kernel/random/boot_id"
+    return ["ip", "netns", "exec", space, "sh", "-c", f'{mounts} && exec "$@"', "sh"]
+
+
 def _connect(spaces: dict[str, str]) -> None:
     head = spaces["head"]
     _ip("-n", head, "link", "add", "bridge", "type", "bridge")
@@ -98,12 +107,13 @@ class Party:
     machines: Machines
     folder: Path
     options: tuple[str, ...] = ()
+    graph: Path = HOSTS
     hosts: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
 
     def start(self, host: str, *settings: str) -> subprocess.Popen[str]:
         own = [f"sink.path={self.folder / 'out.txt'}", *settings] if host == "head" else []
         changes = [part for setting in own for part in ("--set", setting)]
-        self.hosts[host] = self.machines.start(host, self.folder, *self.options, *changes)
+        self.hosts[host] = self.machines.start(host, self.folder, *self.options, *changes, graph=self.graph)
         return self.hosts[host]
 
     def start_all(self, *settings: str) -> Party:

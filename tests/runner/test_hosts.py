@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import zenoh
 
+from runner.bus import free_endpoint
 from runner.cli import main
 from runner.keys import make_keys
 from runner.network import Host
@@ -15,6 +17,24 @@ from runner.recording import Recording
 from tests.runner.machines import HOSTS, NAMES, Machines, Party, in_namespaces, on_loopback, run_here
 from tests.runner.test_runs import Run, processes_of, read_until
 
+SUMS = """
+name: sums
+hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1}
+stages:
+  counter:
+    stage: tests.runner.toys:Counter
+  adder:
+    stage: tests.runner.survivors:Adder
+    config:
+      marks: ???
+    inputs: {number: counter.number}
+    host: worker1
+  sink:
+    stage: tests.runner.toys:DoubleSink
+    config:
+      path: ???
+    inputs: {double: adder.double}
+"""
 SLOW_PIECES = ("worker.seconds=0.3",)
 
 
@@ -30,11 +50,11 @@ def namespaces() -> Iterator[Machines]:
 
 
 @pytest.fixture
-def parties() -> Iterator[Callable[[Machines, Path, tuple[str, ...]], Party]]:
+def parties() -> Iterator[Callable[..., Party]]:
     made: list[Party] = []
 
-    def make(machines: Machines, folder: Path, options: tuple[str, ...] = ()) -> Party:
-        made.append(Party(machines, folder, options))
+    def make(machines: Machines, folder: Path, options: tuple[str, ...] = (), graph: Path = HOSTS) -> Party:
+        made.append(Party(machines, folder, options, graph))
         return made[-1]
 
     yield make
@@ -162,6 +182,33 @@ def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixtur
     assert "settings are the head's" in capfd.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_stateful_stage_gets_its_state_back_on_its_host(parties, tmp_path: Path):
+    graph = tmp_path / "sums.yaml"
+    graph.write_text(SUMS)
+    results: list[str] = []
+    for folder, deaths in ((tmp_path / "plain", "[]"), (tmp_path / "killed", "[2, 3]")):
+        folder.mkdir()
+        party = parties(on_loopback(), folder, graph=graph)
+        party.start("head", f"adder.marks={folder}", f"adder.die_at={deaths}")
+        party.start("worker1")
+        head = party.end("head")
+        assert head.code == 0, head.output
+        results.append((folder / "out.txt").read_text())
+    assert (results[0], head.output.count("adder restarts")) == (results[1], 2)
+
+
+@pytest.mark.slow
+def test_hosts_meet_at_a_router_that_is_none_of_them(here: Run, parties, tmp_path: Path):
+    graph, endpoint = tmp_path / "graph.yaml", free_endpoint().partition("/")[2]
+    graph.write_text(f"router: {endpoint}\n{HOSTS.read_text()}")
+    assert main(["keys", "init", str(graph)]) == 0
+    router = zenoh.open(zenoh.Config.from_file(str(tmp_path / "keys" / "router" / "zenohd.json5")))
+    party = parties(on_loopback(), tmp_path, ("--set", f"keys={tmp_path / 'keys'}"), graph=graph).start_all()
+    assert_same_result(party.end("head"), here)
+    router.close()
+
+
 # ---------------------------------------------------------------------------------------------- in namespaces
 
 
@@ -170,7 +217,10 @@ def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixtur
 def test_three_machines_with_keys_give_the_bytes_of_one(here, namespaces, parties, tmp_path: Path, router):
     options = (*with_keys(namespaces, tmp_path / "keys"), *router)
     party = parties(namespaces, tmp_path, options).start_all()
-    assert_same_result(party.end("head"), here)
+    head = party.end("head")
+    assert_same_result(head, here)
+    travelled = {step.stage: step.travelled_ns for step in Recording(head.recording).steps}
+    assert (travelled["worker"], travelled["splitter"] > 0) == (0, True)  # clocks of two machines are not compared
     assert [party.end(name).code for name in NAMES[1:]] == [0, 0]
 
 

@@ -16,11 +16,13 @@ from runner.contract import Refused
 from runner.delivery import Delivery
 from runner.document import Document, read_document
 from runner.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
-from runner.hosts import differences, moved
+from runner.hosts import ABSENT_SECONDS, Hello, Hosts, differences, moved
 from runner.network import Host, Layout, read_layout, read_owners
 from tests.runner.machines import HOSTS
+from tests.runner.test_runs import DOUBLES, finish, read_until, start
 
 OUT = "sink.path=out.txt"
+LOOPBACK_HEX = "0100007F"
 LINE = "hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1, worker2: 127.0.0.1}"
 PLACED = "host: {worker1: 1, worker2: 1}"
 
@@ -224,3 +226,48 @@ def test_a_replica_is_there_while_one_of_its_processes_is():
         presence.update(process, present)
     presence.update(Process("worker", 0, 0), False)
     assert presence.wait_for([("worker", 0)], lambda: True)
+
+
+def test_a_host_that_stays_away_ends_what_runs_nowhere_else(tmp_path: Path):
+    graph = load(tmp_path, f"hosts.head={free_endpoint().partition('/')[2]}")
+    said: list[str] = []
+    hosts = Hosts("hosts", tmp_path / "graph.yaml", graph.layout, lambda text, _: said.append(text))
+    there = Hello("worker2", 1, "", "", "", "", "")
+    hosts._places["worker2"].hello = there
+    hosts._places["worker1"].lost_at = time.monotonic() - ABSENT_SECONDS / 2
+    assert hosts.overdue({"sink": {"worker1"}}) is None
+    hosts._places["worker1"].lost_at = time.monotonic() - ABSENT_SECONDS - 1
+    assert hosts.overdue(graph.hosts_of_stages()) is None  # worker has a replica on worker2
+    assert hosts.overdue({"sink": {"worker1"}}) == "host worker1 has been cut off for 60 s, and sink runs nowhere else"
+    hosts._places["worker2"].hello = None
+    hosts.close(0, "")
+
+
+def test_without_keys_nothing_listens_beyond_loopback(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, "counter.count=100000", "counter.period=0.005", "sink.count=100000")
+    before = read_until(process, "processes are ready")
+    addresses = {address for pid in descendants(process.pid) for address in listening(pid)}
+    process.terminate()
+    finish(process, tmp_path, before)
+    assert len(addresses) >= 5
+    assert {address.partition(":")[0] for address in addresses} == {LOOPBACK_HEX}
+
+
+def descendants(pid: int) -> list[int]:
+    """A process and everything it has started."""
+    children = [
+        int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
+    ]
+    return [pid, *(one for child in children for one in descendants(child))]
+
+
+def listening(pid: int) -> set[str]:
+    """ADDRESS:PORT, in hex, of everything that a process would answer to: TCP listeners and bound UDP sockets."""
+    own = {str(path.readlink()) for path in Path(f"/proc/{pid}/fd").iterdir()}
+    found: set[str] = set()
+    for table, state in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == state and f"socket:[{fields[9]}]" in own:
+                found.add(fields[1])
+    return found
