@@ -28,6 +28,7 @@ import hashlib
 import json
 import os
 import queue
+import re
 import socket
 import struct
 import sys
@@ -80,10 +81,10 @@ class Process:
     @staticmethod
     def of(key: str) -> Process:
         """The process that a key ends with; raises Refused where it names none."""
-        stage, replica, incarnation = key.split("/")[-3:]
-        if not all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (replica, incarnation)):
+        match = re.search(r"(?:^|/)([^/]+)/([0-9]{1,9})/([0-9]{1,9})$", key)
+        if match is None:
             raise Refused(f"names no process: {key[-60:]}; valid: STAGE/REPLICA/INCARNATION")
-        return Process(stage, int(replica), int(incarnation))
+        return Process(match[1], int(match[2]), int(match[3]))
 
     @property
     def path(self) -> str:

@@ -11,7 +11,7 @@ from runner.bus import Packet
 from runner.codec import CodecError
 
 R = TypeVar("R", bound=msgspec.Struct)
-SHOWN = 3
+SHOWN = 10
 """Refusals that are shown each; after that only those whose number is a power of ten."""
 
 

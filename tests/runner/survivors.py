@@ -94,6 +94,28 @@ class NeverReady(Stage):
         del number
 
 
+class GatedCounter(Stage):
+    """Counts like the toy counter; the last number waits for a file."""
+
+    device = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        go: Path
+        count: int = 5
+        period: float = 0.0
+
+    def __init__(self, config: Config):
+        self._config = config
+
+    def source(self, ctx: Context) -> Iterator[Number]:
+        for value in range(self._config.count):
+            while value == self._config.count - 1 and not self._config.go.exists():
+                time.sleep(0.01)
+            yield Number(value=value, last=value == self._config.count - 1)
+            time.sleep(self._config.period)
+
+
 class Picture(Message, frozen=True, kw_only=True):
     pixels: Annotated[NDArray[np.uint8], Spec("uint8", ("N",))]
     last: bool

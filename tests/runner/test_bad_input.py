@@ -1,0 +1,230 @@
+"""Whatever arrives on whatever key: refused, counted and named; nothing crashes and the graph answers the same."""
+
+import random
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from runner.bus import RECORDER, Bus, Packet, Presence, free_endpoint
+from runner.children import last_lines, spawn
+from runner.codec import CodecError, Envelope, LogLine, Pulse, Receipt, Step, envelope, pack, unpack
+from runner.graph import Route, load_graph, node_entry
+from runner.host import Assignment
+from runner.recorder import Manifest
+from runner.recording import Recording
+from runner.refusals import Refusals
+from tests.runner.survivors import Picture
+from tests.runner.test_runs import TOYS, finish, processes_of, read_until, run, start
+from tests.runner.test_survival import ALBUM, changed, wait_until
+from tests.runner.toys import Answer
+
+MESSAGES = 10_000
+KEYS = (
+    *("m/counter/number", "m/worker/answer", "m/sink/finished", "m/nobody/nothing", "d/splitter/0/number"),
+    *("d/worker/0/piece", "d/worker/1/number", "d/gatherer/0/answers", "d/gatherer/0/nothing", "d/sink/0/total"),
+    *("s/splitter", "s/worker", "s/nobody", "j/splitter", "j/worker", "j/gatherer", "r/splitter", "r/worker", "r/sink"),
+    *("l/worker", "l/supervisor", "l/recorder", "h/worker/0", "h/recorder/0", "h/nobody", "gone/worker/0/0", "gone/x"),
+)
+
+
+class Mutator:
+    """Makes bad payloads of good ones, always the same for one seed."""
+
+    def __init__(self, good: list[bytes], seed: int) -> None:
+        self._good = good
+        self._random = random.Random(seed)
+        self._ways: list[Callable[[bytearray], bytes]] = [
+            self._noise, self._flip, self._flip, self._cut, self._extend, self._number, self._element, self._nest
+        ]  # fmt: skip
+
+    def __call__(self) -> bytes:
+        return self._random.choice(self._ways)(bytearray(self._random.choice(self._good)))
+
+    def _noise(self, _: bytearray) -> bytes:
+        return self._random.randbytes(self._random.randrange(200))
+
+    def _flip(self, payload: bytearray) -> bytes:
+        for _ in range(self._random.randint(1, 4)):
+            payload[self._random.randrange(len(payload))] = self._random.randrange(256)
+        return bytes(payload)
+
+    def _cut(self, payload: bytearray) -> bytes:
+        return bytes(payload[: self._random.randrange(len(payload))])
+
+    def _extend(self, payload: bytearray) -> bytes:
+        return bytes(payload) + self._random.randbytes(self._random.randint(1, 50))
+
+    def _number(self, payload: bytearray) -> bytes:
+        """Another sequence number, or another version."""
+        text = re.sub(rb"#(\d)", lambda _: b"#%d" % self._random.randrange(10), bytes(payload))
+        return text.replace(b"version\x01", bytes([*b"version", self._random.randrange(2, 128)]))
+
+    def _element(self, payload: bytearray) -> bytes:
+        """Arrays of other elements, and NaN in them."""
+        other = self._random.choice((b"object_", b"complex", b"float32", b"int64\0\0"))
+        return bytes(payload).replace(b"float64", other).replace(b"\x3f", b"\xff")
+
+    def _nest(self, _: bytearray) -> bytes:
+        """Deep nesting, or a length that nothing follows."""
+        return self._random.choice(
+            (b"\x91" * self._random.randint(1, 20_000), b"\xc6\xff\xff\xff\xff", b"\xdf\x7f\xff\xff\xff")
+        )
+
+
+def payloads_of(path: Path) -> list[bytes]:
+    """Every kind of payload that a run has sent."""
+    recording = Recording(path)
+    records: list[Any] = [*recording.envelopes(), *recording.steps, *recording.log]
+    records += [Receipt(port, id) for step in recording.steps for port, id in step.consumed]
+    records += [Pulse(step.stage, step.replica, 0, 1, "here") for step in recording.steps]
+    return [pack(record) for record in records]
+
+
+def test_ten_thousand_bad_messages_change_nothing(tmp_path: Path):
+    calm, rough = tmp_path / "calm", tmp_path / "rough"
+    calm.mkdir()
+    rough.mkdir()
+    undisturbed = run(TOYS, calm)
+    process = start(changed(TOYS, rough, Counter="GatedCounter"), rough, f"counter.go={rough / 'go'}")
+    before = read_until(process, "processes are ready")
+    match = re.search(r"run (\S+) on (\S+)", before)
+    assert match is not None
+    stray = Bus(match[1], connect=match[2])
+    bad, keys = Mutator(payloads_of(undisturbed.recording), 1), random.Random(2)
+    alive = processes_of(rough)
+    for _ in range(MESSAGES):
+        stray.publish(keys.choice(KEYS), bad())
+    stray_tokens(stray, match[1])
+    assert process.poll() is None and processes_of(rough) == alive, finish(process, rough, before).output
+    (rough / "go").touch()
+    ended = finish(process, rough, before)
+    stray.close()
+    assert (ended.code, ended.result) == (0, undisturbed.result), ended.output
+    assert Recording(ended.recording).verdict.complete
+    assert "restarts (" not in ended.output
+    for who in ("supervisor", "recorder", "gatherer", "splitter"):
+        assert re.search(rf"{who} +\S+: message refused \(100 so far\): ", ended.output), ended.output
+
+
+def stray_tokens(stray: Bus, run_id: str) -> None:
+    """Presence of processes that there are not."""
+    session: Any = vars(stray)["_session"]
+    for path in ("present/worker/0/9", "present/worker/0/9/0011223344556677", "present/worker/7/0/x", "present/x"):
+        session.liveliness().declare_token(f"{run_id}/{path}")
+
+
+def test_what_is_wrong_is_named(tmp_path: Path):
+    samples = np.zeros(3)
+    good = envelope(
+        Answer(index=0, count=4, samples=samples),
+        id="worker.answer#0",
+        lineage="counter.number#0",
+        time_ns=0,
+        causes=(),
+    )
+    body = bytes(good.body)
+    change: Callable[..., Envelope] = msgspec.structs.replace
+    bad = {
+        "type: expected Answer, got 'Number'": change(good, type="Number"),
+        "version: expected Answer 1, got 2": change(good, version=2),
+        "element type 'object64' is not one of": change(
+            good, body=msgspec.Raw(body.replace(b"float64", b"object64"[:7]))
+        ),
+        "NaN or infinity in 1 elements": change(good, body=msgspec.Raw(body[:-8] + np.float64(np.nan).tobytes())),
+        "do not fill shape": change(good, body=msgspec.Raw(body.replace(b"\x91\x03", b"\x91\x04"))),
+        "not sent by a process of this run": good,
+    }
+    bad["element type 'object6' is not one of"] = bad.pop("element type 'object64' is not one of")
+    process = start(changed(TOYS, tmp_path, Counter="GatedCounter"), tmp_path, f"counter.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    match = re.search(r"run (\S+) on (\S+)", before)
+    assert match is not None
+    stray = Bus(match[1], connect=match[2])
+    time.sleep(0.5)
+    for sealed in bad.values():
+        stray.publish("d/gatherer/0/answers", pack(sealed))
+    before += read_until(process, "d/gatherer/0/answers: message refused (6 so far)")
+    (tmp_path / "go").touch()
+    ended = finish(process, tmp_path, before)
+    stray.close()
+    assert (ended.code, len(ended.result)) == (0, 5), ended.output
+    for reason in bad:
+        assert reason in ended.output, (reason, ended.output)
+
+
+def test_bad_messages_of_the_run_itself_crash_no_process(tmp_path: Path):
+    """A faulty process knows the secret: what it sends is checked as closely."""
+    endpoint, secret = free_endpoint(), "secret"
+    graph = load_graph(ALBUM, (f"sink.path={tmp_path / 'out.txt'}",))
+    bus = Bus("bad", listen=endpoint, secret=secret)
+    presence, pulses = Presence(), list[Pulse]()
+    bus.watch(presence.update)
+    bus.subscribe("h/glance/0", lambda packet: pulses.append(unpack(Pulse, packet.payload)))
+    manifest = Manifest(
+        "bad", endpoint, str(tmp_path / "bad.mcap"), '{"name": "bad", "seed": 0, "stages": {}}', (), {}, secret=secret
+    )
+    assignment = Assignment(
+        run="bad",
+        endpoint=endpoint,
+        directory=str(tmp_path),
+        stage="glance",
+        entry=node_entry(graph.nodes["glance"]),
+        seed=0,
+        routes=(Route("nothing", "sink", "picture", "block", 4, shared=False, kept=0),),
+        processes=(("glance", 0),),
+        secret=secret,
+    )
+    recorder = spawn("runner.recorder", task=msgspec.json.encode(manifest), log=tmp_path / "recorder.txt")
+    host = spawn("runner.host", task=msgspec.json.encode(assignment), log=tmp_path / "host.txt")
+    assert presence.wait_for([(RECORDER, 0), ("glance", 0)], lambda: host.poll() is not None)
+    picture = Picture(pixels=np.zeros(100, np.uint8), last=False)
+    good: list[Any] = [Receipt("picture", "camera.picture#1"), LogLine("glance", 0, "info", "text", 5)]
+    good += [
+        Step("glance", 0, 0, n, "on_picture", (("picture", f"camera.picture#{n}"),), (), 5, 1, 1, 1) for n in range(9)
+    ]
+    good += [
+        envelope(picture, id=f"camera.picture#{n}", lineage=f"camera.picture#{n}", time_ns=5, causes=())
+        for n in range(9)
+    ]
+    bad, keys = Mutator([pack(one) for one in good], 3), random.Random(4)
+    for _ in range(MESSAGES):
+        bus.publish(
+            keys.choice(("d/glance/0/picture", "j/sink", "r/sink", "m/camera/picture", "s/glance", "l/glance")), bad()
+        )
+    steps = max((pulse.steps for pulse in pulses), default=0)
+    last = envelope(picture, id="camera.picture#500000", lineage="camera.picture#500000", time_ns=5, causes=())
+    bus.publish("d/glance/0/picture", pack(last))
+    wait_until(lambda: pulses and pulses[-1].refused > 1000 and pulses[-1].steps > min(steps, pulses[-1].steps - 1))
+    assert bus.flush()
+    for process in (host, recorder):
+        process.terminate()
+    assert (host.wait(60), recorder.wait(60)) == (0, 1), last_lines(tmp_path / "host.txt", 9)
+    bus.close()
+    assert "malformed" not in "".join(last_lines(tmp_path / "recorder.txt", 1))
+    assert Recording(tmp_path / "bad.mcap").damage == []
+
+
+@pytest.mark.parametrize("kind", [Envelope, Step, Receipt, LogLine, Pulse])
+def test_a_record_is_read_or_refused(kind: type[Any], tmp_path: Path):
+    """Ten thousand of each kind: nothing but CodecError is ever raised, and every refusal is counted."""
+    good: list[Any] = [
+        Step("a", 0, 0, 1, "on_b", (("b", "c.d#1"),), ("a.e#1",), 5, 1, 1, 1),
+        Receipt("b", "c.d#1"),
+        LogLine("a", 0, "info", "text", 5),
+        Pulse("a", 0, 0, 1, "here"),
+        envelope(Answer(index=0, count=1, samples=np.ones(2)), id="a.b#1", lineage="a.b#1", time_ns=5, causes=()),
+    ]
+    said: list[str] = []
+    refusals = Refusals(said.append)
+    bad = Mutator([pack(one) for one in good], 5)
+    read = sum(refusals.read(kind, Packet("k", bad(), 0, 0)) is not None for _ in range(MESSAGES))
+    assert refusals.count == MESSAGES - read
+    assert 10 <= len(said) < 20
+    with pytest.raises(CodecError, match="MessagePack"):
+        unpack(kind, b"\xc1")
