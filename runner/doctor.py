@@ -24,6 +24,7 @@ from runner.contract import Refused
 from runner.graph import load_graph
 from runner.info import byte_count
 from runner.registry import registry_folder
+from runner.tables import from_here
 
 Judgement = Literal["good", "note", "bad"]
 LEAST_DISK = 2 * 10**9
@@ -246,7 +247,7 @@ def _recordings(folder: Path) -> Iterator[Finding]:
     free = shutil.disk_usage(beside).free
     judgement: Judgement = "good" if free >= LEAST_DISK else "bad"
     remedy = "" if judgement == "good" else "remove old recordings, or runner up GRAPH --recordings DIR"
-    yield Finding(judgement, "recordings", f"{byte_count(free)} free in {beside}", remedy)
+    yield Finding(judgement, "recordings", f"{byte_count(free)} free in {from_here(str(beside))}", remedy)
 
 
 def _memory() -> Iterator[Finding]:

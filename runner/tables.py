@@ -31,8 +31,8 @@ SHOWN_LINES = 24
 def status_text(status: RunStatus) -> str:
     """A run in one line, and its processes in a table."""
     age = seconds((time.time() - status.started) * 1e9)
-    recording = _from_here(status.recording)
-    head = f"{status.run}: {_from_here(status.graph)}, up {age}, {status.endpoint}, recording {recording}"
+    recording = from_here(status.recording)
+    head = f"{status.run}: {from_here(status.graph)}, up {age}, {status.endpoint}, recording {recording}"
     titles = ("process", "state", "pid", "cpu", "memory", "queue", "steps/s", "restarts", "last reason")
     return "\n".join((head, *table(titles, map(_process_row, status.processes))))
 
@@ -74,7 +74,8 @@ def topics_text(status: RunStatus) -> str:
     return "\n".join(table(("topic", "type", "sent", "per second", "bytes/s", "goes to"), rows))
 
 
-def _from_here(path: str) -> str:
+def from_here(path: str) -> str:
+    """A path as a user in this folder would type it."""
     here = f"{Path.cwd()}{os.sep}"
     return path.removeprefix(here)
 

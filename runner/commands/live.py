@@ -171,10 +171,11 @@ def _restart(options: argparse.Namespace) -> int:
 def _down(options: argparse.Namespace) -> int:
     from runner.live import Live, wait_until_gone
     from runner.registry import find_run
+    from runner.tables import from_here
 
     entry = find_run(options.run)
     with Live(entry) as live:
         live.down()
     wait_until_gone(entry)
-    print(f"{entry.run} has ended; recording {entry.recording}")
+    print(f"{entry.run} has ended; recording {from_here(entry.recording)}")
     return 0
