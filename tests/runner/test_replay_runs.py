@@ -32,7 +32,7 @@ def test_a_run_with_a_killed_replica_replays_to_the_byte(killed: Run, workers: i
     assert "restarts (1 of 3)" in killed.output
     code, said = verify(path, "worker.die_at=-1", workers=workers)
     assert code == 0, said
-    assert "IDENTICAL: 45 messages of 3 stages" in said
+    assert "IDENTICAL: 45 messages of 4 stages" in said
 
 
 def test_without_replicas_and_under_load_it_replays_to_the_byte(alone: Run):
