@@ -346,10 +346,19 @@ class Supervisor:
         """Waits for the end, and replaces what crashes meanwhile."""
         while True:
             with contextlib.suppress(queue.Empty):
-                return self._events.get(timeout=TICK_SECONDS)
+                end = self._events.get(timeout=TICK_SECONDS)
+                self._name_the_dead()
+                return end
             end = self._look_after_children()
             if end is not None:
                 return end
+
+    def _name_the_dead(self) -> None:
+        """Of what died just before the end, and is not replaced."""
+        for child in self._children.values():
+            if child.handle.poll() and child.heir is None:
+                name = self._name_of(child.process.stage, child.process.replica)
+                self._say(f"{name} died meanwhile: {child.reason(self._pulses.of(child.process))}", "warning")
 
     def _look_after_children(self) -> End | None:
         if self._recorder is not None:
@@ -526,7 +535,7 @@ class Supervisor:
     def _process_status(self, child: _Child) -> ProcessStatus:
         process = child.process
         pulse = self._pulses.of(process)
-        state = "starting" if pulse is None or not (child.announced or process.stage == RECORDER) else pulse.state
+        state = self._rates.state(process.stage, process.replica) if pulse and child.announced else "starting"
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from runner.contract import Context, Finished, Message, Spec, Stage
 from tests.runner.toys import Answer, Double, Number, Piece
 
-HELD_BYTES = 300_000_000
-
 
 class Troubled(Stage):
     """Answers pieces like the toy worker; the first process to see a number gets into the trouble set for it."""
@@ -29,6 +27,7 @@ class Troubled(Stage):
         stop_at: int = -1
         loop_at: int = -1
         grow_at: int = -1
+        grow_bytes: int = 300_000_000
         exit_at: int = -1
 
     def __init__(self, config: Config):
@@ -55,7 +54,7 @@ class Troubled(Stage):
             pass
 
     def grow(self) -> None:
-        self._held.append(np.ones(HELD_BYTES, np.uint8))
+        self._held.append(np.ones(self._config.grow_bytes, np.uint8))
         time.sleep(600)
 
     def exit(self) -> None:

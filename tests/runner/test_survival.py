@@ -7,8 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import pytest
 
 from runner.recording import Recording
 from tests.runner.test_replay import verify
@@ -99,9 +101,15 @@ OTHER = """
 
 
 def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
-    silent = run(changed(TOYS, tmp_path, Worker="Troubled"), tmp_path, f"worker.marks={tmp_path}", "worker.exit_at=1")
+    silent = run(
+        changed(TOYS, tmp_path, Worker="Troubled"),
+        tmp_path,
+        f"worker.marks={tmp_path}",
+        "worker.exit_at=1",
+        "worker.replicas=1",
+    )
     assert silent.code == 0, silent.output
-    assert re.search(r"worker\.\d restarts \(1 of 3\): ended with exit code 3", silent.output)
+    assert re.search(r"worker restarts \(1 of 3\): ended with exit code 3", silent.output)
 
 
 def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
@@ -245,3 +253,45 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+# ------------------------------------------------------------------------------------ memory of the machine
+
+
+@pytest.fixture
+def small_group() -> Iterator[Path]:
+    """A control group of the kernel with little memory; skipped where this user may not make one."""
+    for parent, limit in (
+        (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes"),
+        (Path("/sys/fs/cgroup"), "memory.max"),
+    ):
+        group = parent / f"runner-test-{os.getpid()}"
+        try:
+            group.mkdir()
+            (group / limit).write_text(str(SMALL_BYTES))
+        except OSError:
+            continue
+        yield group
+        wait_until(lambda group=group: not (group / "cgroup.procs").read_text())
+        group.rmdir()
+        return
+    pytest.skip("needs the right to make a control group with a limit of memory")
+
+
+SMALL_BYTES = 900_000_000
+
+
+def test_a_process_that_the_kernel_kills_for_memory_is_named(small_group: Path, tmp_path: Path):
+    graph = changed(TOYS, tmp_path, Worker="Troubled")
+    procs = small_group / "cgroup.procs"
+    settings = (f"worker.marks={tmp_path}", "worker.grow_at=2", "worker.grow_bytes=3000000000", "worker.replicas=1")
+    script = "import os, sys; from pathlib import Path; Path(sys.argv[1]).write_text(str(os.getpid())); "
+    script += "sys.argv = ['runner', *sys.argv[2:]]; from runner.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", script, str(procs), "up", str(graph), "--recordings", str(tmp_path)]
+    command += [part for setting in (f"sink.path={tmp_path / 'out.txt'}", *settings) for part in ("--set", setting)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(
+        r"restarts \(1 of 3\): killed by SIGKILL: the kernel was out of memory; it last held \d", done.stdout
+    )
+    assert len((tmp_path / "out.txt").read_text().splitlines()) == 5
