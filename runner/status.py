@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict, deque
 
 import msgspec
@@ -9,6 +10,7 @@ import msgspec
 from runner.codec import Pulse
 from runner.graph import SUPERVISOR, Graph
 
+SILENT_NS = 3_000_000_000
 WINDOW = 7
 """Pulses over which rates are taken: three seconds."""
 
@@ -82,6 +84,11 @@ class Rates:
         if window and window[-1][1].pid != pulse.pid:
             window.clear()
         window.append((arrived_ns, pulse))
+
+    def state(self, stage: str, replica: int) -> str:
+        """What the newest pulse says, or ``silent`` where none has come for a while."""
+        arrived_ns, newest = self._ends(stage, replica)[1]
+        return newest.state if time.monotonic_ns() - arrived_ns < SILENT_NS else "silent"
 
     def cpu(self, stage: str, replica: int) -> float:
         """Processor time per time of one process."""

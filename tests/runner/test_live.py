@@ -184,6 +184,18 @@ def test_a_run_says_how_its_processes_are(account: Run) -> None:
     assert (number.type, number.consumers) == ("Number", ("account.number",))
 
 
+def test_a_process_that_stands_still_is_silent(account: Run) -> None:
+    pid = account.pid_of("account")
+    with Live(account.entry) as live:
+        live.wait_until_ready()
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            wait_for(lambda: "silent" in [process.state for process in live.status().processes])
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        wait_for(lambda: "silent" not in [process.state for process in live.status().processes])
+
+
 # ------------------------------------------------------------------------------------------ commands
 
 
