@@ -321,7 +321,9 @@ class Recorder:
         self._bus.answer_flush()
         self._bus.announce(Process(RECORDER, 0))
         self._heart.start()
-        self._stopping.wait()
+        # The signal that a supervisor died may reach another thread, and an endless wait would never hear of it.
+        while not self._stopping.wait(FLUSH_SECONDS) and not is_orphan():
+            pass
         if self._is_left_alone():
             self._outlive()
         self._heart.stop()

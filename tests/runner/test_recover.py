@@ -2,6 +2,7 @@
 
 import os
 import random
+import resource
 import signal
 import subprocess
 import time
@@ -16,6 +17,7 @@ from runner.codec import Step, envelope, pack
 from runner.contract import Refused
 from runner.recording import Recording
 from runner.recover import recover
+from runner.supervisor import EXIT_INCOMPLETE
 from tests.runner.recordings import record_toys, rewrite
 from tests.runner.test_recorder import Session
 from tests.runner.test_runs import DOUBLES, processes_of, start
@@ -163,15 +165,37 @@ def children(process: subprocess.Popen[str]) -> list[int]:
     return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
 
 
+def recorder_of(process: subprocess.Popen[str]) -> int:
+    (pid,) = (pid for pid in children(process) if b"runner.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return pid
+
+
+def test_a_disk_that_is_full_slows_no_graph_and_is_its_exit_status(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, "counter.count=150", "counter.period=0.01", "sink.count=150")
+    wait_for_output(process, tmp_path)
+    (path,) = tmp_path.glob("*.mcap")
+    resource.prlimit(recorder_of(process), resource.RLIMIT_FSIZE, (path.stat().st_size + 3000,) * 2)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INCOMPLETE
+    assert len((tmp_path / "out.txt").read_text().splitlines()) == 150
+    assert "INCOMPLETE: writing failed: File too large" in output
+    assert "missing: counter.number#" in output
+    assert "the recording is INCOMPLETE" in output
+
+
+def wait_for_output(process: subprocess.Popen[str], folder: Path) -> None:
+    while not (folder / "out.txt").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+
+
 def everything(process: subprocess.Popen[str]) -> None:
     for pid in [process.pid, *children(process)]:
         os.kill(pid, signal.SIGKILL)
 
 
 def recorder(process: subprocess.Popen[str]) -> None:
-    for pid in children(process):
-        if b"runner.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            os.kill(pid, signal.SIGKILL)
+    os.kill(recorder_of(process), signal.SIGKILL)
 
 
 def supervisor(process: subprocess.Popen[str]) -> None:
@@ -190,9 +214,7 @@ def test_a_graph_killed_at_any_moment_leaves_a_recording(
         folder = tmp_path / str(attempt)
         folder.mkdir()
         process = start(DOUBLES, folder, "counter.count=100000", "counter.period=0.005", "sink.count=100000")
-        while not (folder / "out.txt").exists():
-            assert process.poll() is None
-            time.sleep(0.02)
+        wait_for_output(process, folder)
         time.sleep(seconds)
         killed = time.time_ns()
         kill(process)
