@@ -37,9 +37,9 @@ class Run:
         return (self.folder / "out.txt").read_text().splitlines()
 
 
-def start(graph: Path, folder: Path, *settings: str) -> subprocess.Popen[str]:
+def start(graph: Path, folder: Path, *settings: str, flags: tuple[str, ...] = ()) -> subprocess.Popen[str]:
     changes = [part for setting in (f"sink.path={folder / 'out.txt'}", *settings) for part in ("--set", setting)]
-    command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder), *changes]
+    command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder), *changes, *flags]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

@@ -112,6 +112,16 @@ def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
     assert re.search(r"worker restarts \(1 of 3\): ended with exit code 3", silent.output)
 
 
+def test_without_its_recorder_a_graph_ends(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, *ENDLESS)
+    before = read_until(process, "processes are ready")
+    os.kill(pid_of(tmp_path, "recorder-0"), signal.SIGKILL)
+    ended = finish(process, tmp_path, before)
+    assert (ended.code, ended.output.splitlines()[-1]) == (1, "the recorder killed by SIGKILL")
+    assert not Recording(ended.recording).verdict.complete
+    assert processes_of(tmp_path) == []
+
+
 def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     calm, rough = tmp_path / "calm", tmp_path / "rough"
     calm.mkdir()
@@ -295,3 +305,17 @@ def test_a_process_that_the_kernel_kills_for_memory_is_named(small_group: Path, 
         r"restarts \(1 of 3\): killed by SIGKILL: the kernel was out of memory; it last held \d", done.stdout
     )
     assert len((tmp_path / "out.txt").read_text().splitlines()) == 5
+
+
+# ------------------------------------------------------------------------------------ viewers
+
+
+def test_a_viewer_that_stands_still_changes_nothing_and_is_gone_at_the_end(tmp_path: Path):
+    settings = ("view=tests.runner.toy_views:ToyViews", "counter.period=0.1")
+    process = start(TOYS, tmp_path, *settings, flags=("--view",))
+    before = read_until(process, "the viewer opens")
+    os.kill(pid_of(tmp_path, "viewer"), signal.SIGSTOP)
+    ended = finish(process, tmp_path, before)
+    assert (ended.code, len(ended.result)) == (0, 5), ended.output
+    assert Recording(ended.recording).verdict.complete
+    assert processes_of(tmp_path) == []
