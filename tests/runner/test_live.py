@@ -29,7 +29,7 @@ from runner.live import Live
 from runner.recording import Recording
 from runner.registry import Entry, Registration, find_run, runs
 from runner.tables import show_progress
-from tests.runner.test_runs import HERE, TOYS, finish, read_until
+from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
 
@@ -484,6 +484,7 @@ def test_log_lines_of_a_run_and_its_end_in_order(account: Run) -> None:
     assert read_until(follower, "nothing to add")
     assert runner("down").stdout.startswith(f"{account.entry.run} has ended")
     assert account.entry not in runs()
+    assert processes_of(account.folder) == []
     assert follower.wait(30) == 0
     follower.communicate()
     last = runner("logs", "--recordings", str(account.folder)).stdout
