@@ -37,6 +37,7 @@ from runner.drawing import (
     Transform,
 )
 from stages.messages import (
+    Arrange,
     Arrangement,
     Candidates,
     Frame,
@@ -47,11 +48,13 @@ from stages.messages import (
     Outcome,
     Plan,
     Posterior,
+    Restore,
     RobotCommand,
     RobotState,
     SceneEstimate,
     SceneGraph,
     Snapshot,
+    Teach,
     TransferRequest,
     Verdict,
 )
@@ -447,6 +450,12 @@ def progress_line(message: Message) -> str:
     """A line of the episode's story; empty for messages that do not move it on."""
     line = ""
     match message:
+        case Teach(name=name):
+            line = f"asked to remember **{name}**"
+        case Restore(name=name):
+            line = f"asked to restore **{name}**"
+        case Arrange(kind=kind):
+            line = f"asked for a {kind} scene"
         case Arrangement(kind=kind):
             line = f"the person lays out the **{kind}** scene"
         case LookRequest(purpose=purpose):

@@ -38,6 +38,7 @@ from stages.messages import (
     ObjectPose,
     Observation,
     Posterior,
+    Restore,
     RobotCommand,
     RobotState,
     SceneEstimate,
@@ -307,6 +308,7 @@ def test_progress_tells_the_story(drawn: dict[str, list[Drawing]]) -> None:
     assert "- transfer 1 done" in page.markdown and page.markdown.endswith("**restored**: ")
     failed = outcome(3, transfer("cup", "table", "tray"), failed_stage="ik", reason="out of reach")
     assert progress_line(failed) == "transfer 3 failed at ik: out of reach"
+    assert progress_line(Restore(name="tea")) == "asked to restore **tea**"
 
 
 def test_views_without_a_catalogue_are_refused() -> None:
