@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import resource
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from statistics import median
 
 ROOT = Path(__file__).parents[1]
 IDENTICAL = re.compile(r"^IDENTICAL: (\d+) messages", re.MULTILINE)
-TIMES = re.compile(r"handlers took ([\d.]+) s, when recorded ([\d.]+) s; constructing the stages ([\d.]+) s")
+TIMES = re.compile(r"handlers took ([\d.]+) s .*\(when recorded ([\d.]+) s\), constructing the stages ([\d.]+) s")
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,14 @@ class Outcome:
     messages: int
     seconds: float
     """Wall time from the start of the command to its end."""
+    processor: float
+    """Processor time of the whole command."""
     computed: float
-    """Seconds inside handlers, all processes together."""
-    recorded: float
-    """The same when it was recorded."""
+    """Of it inside handlers."""
     constructing: float
+    """Of it until stages were constructed."""
+    recorded: float
+    """Wall time inside handlers when it was recorded, all processes together."""
     verdict: str
 
 
@@ -44,14 +48,22 @@ def replay_once(path: Path, *, workers: int | None = None, settings: Sequence[st
     command = [sys.executable, "-m", "runner.cli", "replay", str(path), "--verify"]
     command += [] if workers is None else ["--workers", str(workers)]
     command += [part for setting in settings for part in ("--set", setting)]
-    began = time.monotonic()
+    began, before = time.monotonic(), _processor_time()
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     seconds = time.monotonic() - began
     found, times = IDENTICAL.search(done.stdout), TIMES.search(done.stdout)
     computed, recorded, constructing = map(float, times.groups()) if times else (0.0, 0.0, 0.0)
     verdict = (done.stdout + done.stderr).strip().splitlines()[-1]
-    identical = done.returncode == 0 and found is not None
-    return Outcome(identical, int(found[1]) if found else 0, seconds, computed, recorded, constructing, verdict)
+    identical, processor = done.returncode == 0 and found is not None, _processor_time() - before
+    return Outcome(
+        identical, int(found[1]) if found else 0, seconds, processor, computed, constructing, recorded, verdict
+    )
+
+
+def _processor_time() -> float:
+    """Of all children that have ended, seconds."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 @contextmanager
@@ -99,9 +111,11 @@ def report(outcomes: Sequence[Outcome], workers: int, load: int) -> Iterator[str
     rows = (
         ("stages' compute when recorded", middle.recorded),
         (f"  shared by {workers} workers", middle.recorded / workers),
-        ("stages' compute in the replay", middle.computed),
-        ("constructing the stages", middle.constructing),
         ("replay, wall (median)", median(outcome.seconds for outcome in outcomes)),
+        ("replay, processor time", middle.processor),
+        ("  inside handlers", middle.computed),
+        ("  constructing the stages", middle.constructing),
+        ("  imports and all else", middle.processor - middle.computed - middle.constructing),
     )
     yield from (f"{name:<32}{seconds:8.2f} s" for name, seconds in rows)
     yield f"{'wall / recorded compute':<32}{middle.seconds / max(middle.recorded, 1e-9):8.2f}"

@@ -62,9 +62,9 @@ class Result(msgspec.Struct, frozen=True):
     steps: int = 0
     messages: int = 0
     seconds: float = 0.0
-    """Time inside handlers."""
+    """Processor time inside handlers, which does not depend on what else runs."""
     startup: float = 0.0
-    """Seconds until the stage was constructed."""
+    """Processor time until the stage was constructed."""
     within: int = 0
     """Messages that differ, but no more than tolerances allow."""
     diverged: int = 0
@@ -175,14 +175,14 @@ class Reenactment:
         wanted = len(step.emitted) if step.outcome == "stopped" else None
         emissions = itertools.islice(self._executor.run(handler, done.arrivals, time_ns), wanted)
         while True:
-            began = time.perf_counter()
+            began = time.process_time()
             try:
                 sealed = next(emissions, None)
             except Exception as error:
                 done.error = f"{type(error).__name__}: {error}"
                 return
             finally:
-                self.seconds += time.perf_counter() - began
+                self.seconds += time.process_time() - began
             if sealed is None:
                 return
             yield sealed
