@@ -60,8 +60,9 @@ class Registration:
 
 def registry_folder() -> Path:
     """The folder of the entries; raises Refused where others could write to it."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(runtime) / "runner" if runtime else Path(f"/tmp/runner-{os.getuid()}")
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    usable = bool(runtime) and os.access(runtime, os.W_OK | os.X_OK)  # another user's after `su`, or gone
+    folder = Path(runtime) / "runner" if usable else Path(f"/tmp/runner-{os.getuid()}")
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()

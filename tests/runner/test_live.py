@@ -27,7 +27,7 @@ from runner.echo import lines_of
 from runner.graph import load_graph
 from runner.live import Live
 from runner.recording import Recording
-from runner.registry import Entry, Registration, find_run, runs
+from runner.registry import Entry, Registration, find_run, registry_folder, runs
 from runner.tables import show_progress
 from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
 from tests.runner.test_runs import Run as Finished
@@ -159,6 +159,8 @@ def test_a_folder_that_others_may_enter_is_refused(tmp_path: Path, monkeypatch: 
     (tmp_path / "runner").mkdir(mode=0o755)
     with pytest.raises(Refused, match="only this user may enter"):
         runs()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+    assert registry_folder() == Path(f"/tmp/runner-{os.getuid()}")
 
 
 def test_a_supervisor_that_was_killed_is_struck_off_the_list(tmp_path: Path) -> None:
@@ -439,7 +441,8 @@ def test_the_doctor_finds_this_machine_fit_and_a_bad_graph() -> None:
 
 def test_the_doctor_says_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runner.doctor.LEAST_DISK", 10**18)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "runner").mkdir(mode=0o755)
     found = {finding.subject: finding for finding in examine(tmp_path)}
     assert found["recordings"].remedy.startswith("remove old recordings")
     assert found["runs"].judgement == "bad"
