@@ -87,6 +87,8 @@ class _Call:
     stage: str
     answers: frozenset[str]
     """Output ports."""
+    left: set[int]
+    """Replicas that have not done it yet."""
     lines: list[tuple[Level, str]] = field(default_factory=list[tuple[Level, str]])
     step: Step | None = None
     """The step that did it; of replicas, the first."""
@@ -118,13 +120,13 @@ class Calls:
         """Publishes a command and returns its id; raises Refused naming the valid ones where it breaks its type."""
         kind = _find(self._graph, request)
         command = read_command(f"{request.stage} {request.command}", kind, request.arguments)
-        own = ""
+        own, replicas = "", set(range(self._graph.nodes[request.stage].replicas))
 
         def note(id: str) -> None:
             nonlocal own
             own = id
             with self._changed:
-                self._calls[id] = _Call(request.stage, frozenset(map(port_name, kind.answers)))
+                self._calls[id] = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
                 while len(self._calls) > KEPT:
                     self._calls.popitem(last=False)
 
@@ -179,8 +181,9 @@ class Calls:
 
     def _advance(self, own: bool, call: _Call, step: Step) -> None:
         if own:
-            call.step = step
-        if call.step is None:
+            call.step = call.step or step
+            call.left.discard(step.replica)
+        if call.step is None or call.left:
             return
         wanted = {f"{call.stage}.{answer}" for answer in call.answers}
         answers = [id for id in step.emitted if id.partition("#")[0] in wanted]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import signal
@@ -18,8 +19,8 @@ import numpy as np
 import pytest
 
 from runner.bus import Bus, free_endpoint
-from runner.calls import CallRequest, Calls, Progress
-from runner.codec import Envelope, open_envelope, pack, unpack
+from runner.calls import CallQuestion, CallRequest, Calls, Progress
+from runner.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.completion import Shell, script
 from runner.contract import Refused
 from runner.doctor import examine, examine_graph
@@ -268,6 +269,20 @@ def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> 
     with Live(account.entry) as live:
         os.kill(account.pid_of("account"), signal.SIGKILL)
         assert call(live, "add", amount="5").lines == (("info", "5 added"),)
+
+
+def test_a_call_is_done_when_every_replica_has_done_it() -> None:
+    graph = load_graph(ACCOUNT)
+    graph.nodes["account"] = dataclasses.replace(graph.nodes["account"], replicas=2)
+    calls = Calls(graph, lambda port, _, say: say(f"supervisor.{port}#0"))
+    id = calls.call(CallRequest("account", "add", {"amount": "1"}))
+    step = Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0)
+    calls.note_step(step)
+    calls.note_log(LogLine("account", 0, "info", "half done", 1))
+    assert not calls.progress(CallQuestion(id, 0)).done
+    calls.note_step(msgspec.structs.replace(step, replica=1))
+    done = calls.progress(CallQuestion(id, 0))
+    assert (done.done, done.emitted, done.lines) == (True, ("account.sum#0",), (("info", "half done"),))
 
 
 def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixture[str]) -> None:
