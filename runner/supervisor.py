@@ -6,12 +6,11 @@ import os
 import queue
 import secrets
 import signal
-import subprocess
 import threading
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -20,15 +19,16 @@ from runner import codec
 from runner.backpressure import skipped
 from runner.bus import RECORDER, Bus, Packet, Presence, Process, free_endpoint
 from runner.calls import CallQuestion, CallRequest, Calls
-from runner.children import DUMP, ending, last_lines, signal_group, spawn
+from runner.children import DUMP, last_lines, signal_group, spawn
 from runner.codec import CodecError, Envelope, LogLine, Pulse, Receipt, Step
 from runner.contract import Finished, Level, Message, Refused, Restarted
 from runner.delivery import Delivery
 from runner.document import suggest
-from runner.graph import FINISHED, SUPERVISOR, Graph, Limits, graph_to_json, node_entry
-from runner.health import Pulses, Watch, gigabytes, oom_kills
+from runner.family import Child, Progress, end_all
+from runner.graph import FINISHED, SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.health import Pulses, Watch
 from runner.host import EXIT_REFUSED, Assignment
-from runner.hosts import Hosts, RemoteChild
+from runner.hosts import Hosts
 from runner.info import stage_times
 from runner.network import ALONE
 from runner.ports import port_name
@@ -37,7 +37,6 @@ from runner.refusals import Refusals, admit, require_genuine
 from runner.registry import Entry, Registration, runs
 from runner.shared_memory import sweep
 from runner.status import ProcessStatus, Rates, RunStatus, topics_of
-from runner.step import sequence_of
 from runner.terminal import Terminal
 
 STAGE_GRACE_SECONDS = 2.0
@@ -63,63 +62,6 @@ class End:
     reason: str
 
 
-@dataclass(slots=True)
-class _Child:
-    process: Process
-    handle: subprocess.Popen[bytes] | RemoteChild
-    log: Path
-    started: float = field(default_factory=time.monotonic)
-    announced: bool = False
-    ready_after: float = 0.0
-    """Seconds from its start."""
-    crashes: int = 0
-    """How often this process has crashed before, whatever else it was restarted for."""
-    restarted_because: str = ""
-    """Why its predecessor ended."""
-    retires_by: float | None = None
-    """When it is killed if it has not gone by itself; None where it was not asked to."""
-    watch: Watch = field(default_factory=lambda: Watch(Limits()))
-    oom_kills: int = field(default_factory=oom_kills)
-    """By the kernel, before it was started."""
-    log_from: int = 0
-    """Where its own lines begin in the log."""
-    condemned: str = ""
-    """Why the supervisor kills it."""
-    dies_at: float = float("inf")
-    heir: tuple[str, int] | None = None
-    """Once it is dead: why it is replaced, and how often it has crashed by now."""
-
-    def reason(self, newest: Pulse | None = None) -> str:
-        """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
-        if self.condemned:
-            return self.condemned
-        code = self.handle.returncode
-        lines = last_lines(self.log, 1, self.log_from)
-        if lines and code is not None and code >= 0:
-            return lines[0]
-        held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
-        out_of_memory = code == -signal.SIGKILL and oom_kills() > self.oom_kills
-        return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
-
-
-@dataclass(slots=True)
-class _Progress:
-    """How far a stage has come: what its next process must know."""
-
-    numbers: dict[str, int] = field(default_factory=dict[str, int])
-    consumed: deque[tuple[str, str]] = field(default_factory=lambda: deque[tuple[str, str]](maxlen=1000))
-    started: bool = False
-
-    def note(self, step: Step) -> None:
-        if step.outcome != "done":
-            return
-        self.started |= not step.consumed
-        self.consumed.extend(step.consumed)
-        for message_id in step.emitted:
-            port = message_id.partition("#")[0].rpartition(".")[2]
-            self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(message_id) + 1)
-
-
 class Supervisor:
     """One run of a graph."""
 
@@ -131,9 +73,9 @@ class Supervisor:
         self._graph = graph
         self._settings = settings
         self._terminal = terminal
+        self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._run, self.recording = _new_recording(recordings, graph.name)
         self.directory = self.recording.with_suffix("")
-        self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._network = self._hosts.network if self._hosts else None
         self._endpoint = self._hosts.endpoint if self._hosts else free_endpoint()
         listen, connect = (self._hosts.listen(), self._endpoint) if self._hosts else (self._endpoint, None)
@@ -153,11 +95,11 @@ class Supervisor:
         self._stopping = threading.Event()
         self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.publish, self._warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
-        self._progress: dict[str, _Progress] = defaultdict(_Progress)
+        self._progress: dict[str, Progress] = defaultdict(Progress)
         self._steps: list[Step] = []
-        self._children: dict[tuple[str, int], _Child] = {}
-        self._recorder: _Child | None = None
-        self._viewer: _Child | None = None
+        self._children: dict[tuple[str, int], Child] = {}
+        self._recorder: Child | None = None
+        self._viewer: Child | None = None
         self._presence = Presence()
         self._pulses = Pulses()
         self._refusals = Refusals(self._complain)
@@ -270,7 +212,7 @@ class Supervisor:
 
     # ------------------------------------------------------------------------------------------ processes
 
-    def _start_recorder(self) -> _Child:
+    def _start_recorder(self) -> Child:
         topics = {
             f"{stage}/{port}": topic(kind)
             for stage in (*self._graph.nodes, SUPERVISOR)
@@ -289,7 +231,7 @@ class Supervisor:
         )
         return self._spawn(Process(RECORDER, 0), "runner.recorder", msgspec.json.encode(task))
 
-    def _start(self, process: Process) -> _Child:
+    def _start(self, process: Process) -> Child:
         progress = self._progress[process.stage]
         task = Assignment(
             run=self._run,
@@ -312,7 +254,7 @@ class Supervisor:
         host = self._graph.host_of(process.stage, process.replica)
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
             log = self._log_of(process)
-            child = _Child(process, self._hosts.start(host, process, task, log), log)
+            child = Child(process, self._hosts.start(host, process, task, log), log)
         else:
             child = self._spawn(process, "runner.host", msgspec.json.encode(task))
         child.watch = self._watch_of(process)
@@ -325,19 +267,19 @@ class Supervisor:
         kind = self._graph.nodes[process.stage].type.cls
         return kind.stateful and not kind.device and process.incarnation > 0
 
-    def _spawn(self, process: Process, module: str, task: bytes) -> _Child:
+    def _spawn(self, process: Process, module: str, task: bytes) -> Child:
         log = self._log_of(process)
         log_from = log.stat().st_size if log.exists() else 0
-        return _Child(process, spawn(module, task=task, log=log), log, log_from=log_from)
+        return Child(process, spawn(module, task=task, log=log), log, log_from=log_from)
 
     def _log_of(self, process: Process) -> Path:
         return self.directory / "log" / f"{process.stage}-{process.replica}.txt"
 
-    def _start_viewer(self) -> _Child:
+    def _start_viewer(self) -> Child:
         log = self.directory / "log" / "viewer.txt"
         handle = spawn("runner.cli", "view", "--live", str(self.recording), task=b"", log=log)
         self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {log}")
-        return _Child(Process("viewer", 0), handle, log)
+        return Child(Process("viewer", 0), handle, log)
 
     def _recorder_died(self) -> bool:
         return self._recorder is not None and self._recorder.handle.poll() is not None
@@ -384,7 +326,7 @@ class Supervisor:
         reason = hosts.overdue(self._graph.hosts_of_stages())
         return None if reason is None else End(1, reason)
 
-    def _check(self, child: _Child) -> None:
+    def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
         now, name = time.monotonic(), self._name_of(child.process.stage, child.process.replica)
         change = child.watch.look(now, self._pulses.of(child.process), ready=child.announced)
@@ -397,7 +339,7 @@ class Supervisor:
         if now > min(child.dies_at, child.retires_by or child.dies_at):
             signal_group(child.handle, signal.SIGKILL)
 
-    def _replace(self, child: _Child) -> End | None:
+    def _replace(self, child: Child) -> End | None:
         """Restarts a dead process within its budget; otherwise says why the graph ends."""
         process, name = child.process, self._name_of(child.process.stage, child.process.replica)
         reason = child.reason(self._pulses.of(process))
@@ -417,12 +359,12 @@ class Supervisor:
         self._mourn(child, reason, child.crashes + 1)
         return None
 
-    def _mourn(self, child: _Child, reason: str, crashes: int) -> None:
+    def _mourn(self, child: Child, reason: str, crashes: int) -> None:
         """Tells everybody that a process is replaced. What it leaves behind must be known first."""
         child.heir, child.dies_at = (reason, crashes), time.monotonic()
         self._publish_restart(child.process, reason)
 
-    def _succeed(self, child: _Child, reason: str, crashes: int) -> None:
+    def _succeed(self, child: Child, reason: str, crashes: int) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
         waits = child.announced and process not in self._settled
@@ -452,9 +394,9 @@ class Supervisor:
         """Stops the stages, then the recorder, and returns the recorder's verdict."""
         self._stopping.set()
         self._calls.close()
-        _end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
+        end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
         last = [child for child in (self._recorder, self._viewer) if child is not None]
-        _end_all(last, RECORDER_GRACE_SECONDS)
+        end_all(last, RECORDER_GRACE_SECONDS)
         self._bus.close()
         sweep()
         self._registration.close()
@@ -532,7 +474,7 @@ class Supervisor:
             published={f"{SUPERVISOR}/{port}": number for port, number in list(self._numbers.items())},
         )
 
-    def _process_status(self, child: _Child) -> ProcessStatus:
+    def _process_status(self, child: Child) -> ProcessStatus:
         process = child.process
         pulse = self._pulses.of(process)
         state = self._rates.state(process.stage, process.replica) if pulse and child.announced else "starting"
@@ -563,7 +505,7 @@ class Supervisor:
     def _warn(self, text: str) -> None:
         self._say(text, "warning")
 
-    def _show_output(self, child: _Child) -> None:
+    def _show_output(self, child: Child) -> None:
         name = self._name_of(child.process.stage, child.process.replica)
         for line in last_lines(child.log, SHOWN_LINES, child.log_from):
             self._terminal.show(name, f"| {line}", "error")
@@ -589,16 +531,3 @@ def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
             raise Refused(f"{folder / run}: {error.strerror}") from None
         return run, folder / f"{run}.mcap"
     raise AssertionError
-
-
-def _end_all(children: list[_Child], grace_seconds: float) -> None:
-    """Asks children to end, kills those that do not, and whatever they have left behind."""
-    for child in children:
-        signal_group(child.handle, signal.SIGTERM)
-    deadline = time.monotonic() + grace_seconds
-    for child in children:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.handle.wait(max(0.0, deadline - time.monotonic()))
-    for child in children:
-        signal_group(child.handle, signal.SIGKILL)
-        child.handle.wait()

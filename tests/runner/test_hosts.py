@@ -170,7 +170,7 @@ def test_hosts_end_with_their_head(parties, tmp_path: Path):
     for name in NAMES[1:]:
         ended = party.end(name)
         assert (ended.code, "the connection to head is gone" in ended.output) == (1, True), ended.output
-    assert processes_of(tmp_path) == []
+    assert wait_until(lambda: processes_of(tmp_path) == [])
 
 
 def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixture[str]):
