@@ -56,7 +56,7 @@ def tree(recording: Recording, id: str) -> list[str]:
     causes = Causes(recording)
     if id not in recording.messages and causes.step_of(id) is None:
         raise Refused(f"{recording.path}: no message {id!r}{suggest(id, recording.messages)}")
-    root = recording.envelope(id).lineage if id in recording.messages else ""
+    root = recording.messages[id].lineage if id in recording.messages else ""
     return list(_lines(recording, causes, id, root))
 
 
@@ -102,7 +102,7 @@ def _cost(recording: Recording, causes: Causes, id: str, root: str) -> str:
 
 def path_to(recording: Recording, causes: Causes, id: str) -> list[str]:
     """The critical path from the start of a message's lineage to it: at each step the input that came last."""
-    root = recording.envelope(id).lineage if id in recording.messages else ""
+    root = recording.messages[id].lineage if id in recording.messages else ""
     path = [id]
     while path[-1] != root and (cause := causes.last_input(path[-1])) is not None and cause not in path:
         path.append(cause)

@@ -64,8 +64,8 @@ def latency(path: Path) -> list[str]:
 def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
     """One per lineage that a step followed on, the longest first."""
     lineages: dict[str, list[str]] = defaultdict(list)
-    for sealed in recording.envelopes():
-        lineages[sealed.lineage].append(sealed.id)
+    for message in recording.messages.values():
+        lineages[message.lineage].append(message.id)
     paths = [_critical_path(recording, causes, lineage, ids) for lineage, ids in lineages.items()]
     return sorted((path for path in paths if path.hops), key=lambda path: -path.elapsed_ns)
 

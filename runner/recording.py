@@ -58,6 +58,7 @@ class Located:
     """A recorded message without its body, and where that body is."""
 
     id: str
+    lineage: str
     topic: str
     type: str
     log_time_ns: int
@@ -270,10 +271,10 @@ class Recording:
                 self.steps.append(step)
             case LogLine() as line:
                 self.log.append(line)
-            case Envelope(id=id, type=kind):
+            case Envelope(id=id) as sealed:
                 self.repeated[id] += id in self.messages
-                located = Located(id, entry.topic, kind, entry.log_time_ns, len(entry.data), entry.offset)
-                self.messages.setdefault(id, located)
+                where = entry.log_time_ns, len(entry.data), entry.offset
+                self.messages.setdefault(id, Located(id, sealed.lineage, entry.topic, sealed.type, *where))
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:
         envelopes: dict[str, Envelope] = {}

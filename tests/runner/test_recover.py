@@ -31,7 +31,7 @@ ATTEMPTS = 3
 
 @pytest.fixture(scope="module")
 def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_toys(tmp_path_factory.mktemp("toys"))[0]
+    return record_toys(tmp_path_factory.mktemp("toys"), "view=tests.runner.toy_views:ToyViews")[0]
 
 
 def torn(toys: Path, folder: Path, share: float = 0.7) -> Path:
@@ -102,7 +102,9 @@ def test_nothing_is_overwritten_and_nothing_that_still_grows_is_copied(toys: Pat
 @pytest.mark.parametrize("share", [0.3, 0.7, 1.0])
 def test_every_reading_command_reads_a_torn_recording(toys: Path, tmp_path: Path, share: float):
     path = torn(toys, tmp_path, share)
-    for command in reading(path):
+    drawing = [["view", str(path), "--save", str(tmp_path / "toys.rrd")]]
+    drawing += [["export", str(path), "--foxglove", str(tmp_path / "foxglove.mcap")]]
+    for command in (*reading(path), *drawing):
         assert main(command) in (0, 1), command
 
 
