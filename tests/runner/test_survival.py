@@ -83,6 +83,7 @@ def test_every_trouble_is_explained_and_changes_no_byte(tmp_path: Path):
     assert processes_of(rough) == []
 
 
+@pytest.mark.slow
 def test_a_start_up_that_never_ends_is_ended(tmp_path: Path):
     graph = changed(DOUBLES, tmp_path, Doubler="NeverReady")
     graph.write_text(graph.read_text().replace("double: doubler.double", "double: other.double") + OTHER)
@@ -100,6 +101,7 @@ OTHER = """
 """
 
 
+@pytest.mark.slow
 def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
     silent = run(
         changed(TOYS, tmp_path, Worker="Troubled"),
@@ -166,6 +168,7 @@ def test_whoever_wants_the_latest_holds_nobody_up(tmp_path: Path):
     assert processes_of(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
     ended = run(ALBUM, tmp_path, "glance.seconds=0.5", "camera.size=100000", "camera.count=200")
     assert (ended.code, len(ended.result)) == (0, 200), ended.output
@@ -291,6 +294,7 @@ def small_group() -> Iterator[Path]:
 SMALL_BYTES = 900_000_000
 
 
+@pytest.mark.slow
 def test_a_process_that_the_kernel_kills_for_memory_is_named(small_group: Path, tmp_path: Path):
     graph = changed(TOYS, tmp_path, Worker="Troubled")
     procs = small_group / "cgroup.procs"
@@ -310,6 +314,7 @@ def test_a_process_that_the_kernel_kills_for_memory_is_named(small_group: Path, 
 # ------------------------------------------------------------------------------------ viewers
 
 
+@pytest.mark.slow
 def test_a_viewer_that_stands_still_changes_nothing_and_is_gone_at_the_end(tmp_path: Path):
     settings = ("view=tests.runner.toy_views:ToyViews", "counter.period=0.1")
     process = start(TOYS, tmp_path, *settings, flags=("--view",))
