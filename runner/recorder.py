@@ -33,6 +33,8 @@ from runner.tap import Tap
 FLUSH_SECONDS = 0.25
 """A killed recorder loses no more than this."""
 CHUNK_BYTES = 4 * 2**20
+ORPHANED = signal.SIGUSR1
+"""From the kernel, when the supervisor dies: an end that it asks for comes as SIGTERM."""
 ORPHANED_SECONDS = 5.0
 """What stages may take to die with their supervisor before a recorder that outlives it stops waiting for them."""
 LAST_RESORT_SECONDS = 30
@@ -118,6 +120,7 @@ class RecordingWriter:
         self._writer.start(profile=PROFILE)
         self._writer.add_metadata(RUN, run_metadata(manifest))
         self._writer.flush()
+        self._file.flush()
         self._ledger = Ledger(replicated(json.loads(manifest.graph)))
         self._channels: dict[str, int] = {}
         self._queue: queue.SimpleQueue[_Payload | Callable[[], None] | None] = queue.SimpleQueue()
@@ -299,7 +302,7 @@ class Recorder:
 
     def __init__(self, manifest: Manifest) -> None:
         """Creates the recording; raises Refused where that fails."""
-        self._stopping = threading.Event()
+        self._ends: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._bus = Bus(manifest.run, secret=manifest.secret, connect=manifest.endpoint, network=manifest.network)
         self._writer = RecordingWriter(manifest, self._complain)
         self._tap = Tap(self._bus)
@@ -321,36 +324,34 @@ class Recorder:
         self._bus.answer_flush()
         self._bus.announce(Process(RECORDER, 0))
         self._heart.start()
-        # The signal that a supervisor died may reach another thread, and an endless wait would never hear of it.
-        while not self._stopping.wait(FLUSH_SECONDS) and not is_orphan():
-            pass
-        if self._is_left_alone():
+        orphaned = self._wait_for_the_end()
+        if orphaned:
             self._outlive()
         self._heart.stop()
         self._echoes.put(None)
         self._echo.join(FLUSH_SECONDS)
         self._bus.close()
         verdict = self._writer.close()
-        if is_orphan():  # nobody else is left to tidy up
+        if orphaned:  # nobody else is left to tidy up
             time.sleep(YOUNG_SECONDS)
             sweep()
         return verdict
 
-    def stop(self) -> None:
-        """Ends :meth:`run` after what has arrived. May be called from a signal handler."""
-        self._stopping.set()
+    def stop(self, *, orphaned: bool = False) -> None:
+        """Ends :meth:`run` after what has arrived; ``orphaned`` because the supervisor died. May be called from a
+        signal handler."""
+        self._ends.put(orphaned)
+
+    def _wait_for_the_end(self) -> bool:
+        """Returns whether the supervisor has died. A signal may reach another thread: an endless wait would miss it."""
+        while not is_orphan():
+            with contextlib.suppress(queue.Empty):
+                return self._ends.get(timeout=FLUSH_SECONDS)
+        return True
 
     def _on_message(self, packet: Packet) -> None:
         if self._take(Envelope, packet):
             self._tap.pass_on(packet)
-
-    def _is_left_alone(self) -> bool:
-        """Whether the supervisor has died. It ends stages before the recorder: with some left, the kernel may just
-        be about to say so."""
-        deadline = time.monotonic() + ORPHANED_SECONDS / 5
-        while self._present and not is_orphan() and time.monotonic() < deadline:
-            time.sleep(FLUSH_SECONDS / 25)
-        return is_orphan()
 
     def _outlive(self) -> None:
         """The stages die with the supervisor; what they have said until then is recorded."""
@@ -405,7 +406,7 @@ def main() -> int:
     """Records the run on stdin until SIGTERM; exits 0 when the recording is complete, its last line on stderr says
     what is missing."""
     explain_death()
-    die_with_parent(signal.SIGTERM)
+    die_with_parent(ORPHANED)
     for signum in (signal.SIGINT, signal.SIGHUP):
         signal.signal(signum, signal.SIG_IGN)
     manifest = msgspec.json.decode(sys.stdin.buffer.read(), type=Manifest)
@@ -415,6 +416,7 @@ def main() -> int:
         print(refusal, file=sys.stderr, flush=True)
         return EXIT_REFUSED
     signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
+    signal.signal(ORPHANED, lambda *_: recorder.stop(orphaned=True))
     verdict = recorder.run()
     print(f"{manifest.path}: {verdict}", file=sys.stderr, flush=True)
     return 0 if verdict.complete else EXIT_INCOMPLETE
