@@ -1,5 +1,6 @@
 """Whatever arrives on whatever key: refused, counted and named; nothing crashes and the graph answers the same."""
 
+import contextlib
 import random
 import re
 import time
@@ -15,6 +16,7 @@ from runner.bus import RECORDER, Bus, Packet, Presence, free_endpoint
 from runner.children import last_lines, spawn
 from runner.codec import CodecError, Envelope, LogLine, Pulse, Receipt, Step, envelope, pack, unpack
 from runner.graph import Route, load_graph, node_entry
+from runner.health import PULSE_SECONDS
 from runner.host import Assignment
 from runner.recorder import Manifest
 from runner.recording import Recording
@@ -93,14 +95,15 @@ def test_ten_thousand_bad_messages_change_nothing(tmp_path: Path):
     undisturbed = run(TOYS, calm)
     process = start(changed(TOYS, rough, Counter="GatedCounter"), rough, f"counter.go={rough / 'go'}")
     before = read_until(process, "processes are ready")
-    match = re.search(r"run (\S+) on (\S+)", before)
-    assert match is not None
-    stray = Bus(match[1], connect=match[2])
+    stray = Stray(before)
     bad, keys = Mutator(payloads_of(undisturbed.recording), 1), random.Random(2)
     alive = processes_of(rough)
+    meeting = {"recorder": "m/x/y", "counter": "r/splitter", "splitter": "d/splitter/0/number", "worker": "r/gatherer"}
+    stray.meet(**meeting)
     for _ in range(MESSAGES):
         stray.publish(keys.choice(KEYS), bad())
-    stray_tokens(stray, match[1])
+    stray_tokens(stray)
+    wait_until(lambda: min(stray.refused[who] for who in meeting) > 200)
     assert process.poll() is None and processes_of(rough) == alive, finish(process, rough, before).output
     (rough / "go").touch()
     ended = finish(process, rough, before)
@@ -108,15 +111,45 @@ def test_ten_thousand_bad_messages_change_nothing(tmp_path: Path):
     assert (ended.code, ended.result) == (0, undisturbed.result), ended.output
     assert Recording(ended.recording).verdict.complete
     assert "restarts (" not in ended.output
-    for who in ("supervisor", "recorder", "gatherer", "splitter"):
+    for who in ("supervisor", "recorder", "splitter"):
         assert re.search(rf"{who} +\S+: message refused \(100 so far\): ", ended.output), ended.output
 
 
-def stray_tokens(stray: Bus, run_id: str) -> None:
+class Stray(Bus):
+    """Somebody who knows where a run is and not its secret; hears what its processes say they refused."""
+
+    def __init__(self, seen: str) -> None:
+        match = re.search(r"run (\S+) on (\S+)", seen)
+        assert match is not None
+        super().__init__(match[1], connect=match[2])
+        self.run = match[1]
+        self.refused: dict[str, int] = {}
+        self.subscribe("h/**", self._on_pulse)
+
+    def _on_pulse(self, packet: Packet) -> None:
+        with contextlib.suppress(CodecError):
+            pulse = unpack(Pulse, packet.payload)
+            if pulse.pid > 1000:  # no mutation of ours
+                self.refused[pulse.stage] = max(self.refused.get(pulse.stage, 0), pulse.refused)
+
+    def meet(self, **keys: str) -> None:
+        """Sends until every process has refused something: only then it is linked to all of them."""
+
+        def met() -> bool:
+            for stage, key in keys.items():
+                if not self.refused.get(stage):
+                    self.publish(key, b"\xc1")
+            time.sleep(2 * PULSE_SECONDS)
+            return all(self.refused.get(stage) for stage in keys)
+
+        wait_until(met)
+
+
+def stray_tokens(stray: Stray) -> None:
     """Presence of processes that there are not."""
     session: Any = vars(stray)["_session"]
     for path in ("present/worker/0/9", "present/worker/0/9/0011223344556677", "present/worker/7/0/x", "present/x"):
-        session.liveliness().declare_token(f"{run_id}/{path}")
+        session.liveliness().declare_token(f"{stray.run}/{path}")
 
 
 def test_what_is_wrong_is_named(tmp_path: Path):
@@ -143,13 +176,11 @@ def test_what_is_wrong_is_named(tmp_path: Path):
     bad["element type 'object6' is not one of"] = bad.pop("element type 'object64' is not one of")
     process = start(changed(TOYS, tmp_path, Counter="GatedCounter"), tmp_path, f"counter.go={tmp_path / 'go'}")
     before = read_until(process, "processes are ready")
-    match = re.search(r"run (\S+) on (\S+)", before)
-    assert match is not None
-    stray = Bus(match[1], connect=match[2])
-    time.sleep(0.5)
+    stray = Stray(before)
+    stray.meet(gatherer="d/gatherer/0/answers")
     for sealed in bad.values():
         stray.publish("d/gatherer/0/answers", pack(sealed))
-    before += read_until(process, "d/gatherer/0/answers: message refused (6 so far)")
+    before += read_until(process, "element type 'object6'")
     (tmp_path / "go").touch()
     ended = finish(process, tmp_path, before)
     stray.close()
