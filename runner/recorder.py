@@ -25,7 +25,19 @@ from runner.contract import Message, Refused
 from runner.health import Heart
 from runner.network import Network
 from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
-from runner.recording import JOURNAL, LOG, PROFILE, RUN, VERDICT, Ledger, Verdict, replicated, split_id, topic_of
+from runner.recording import (
+    JOURNAL,
+    LOG,
+    PROFILE,
+    RUN,
+    STEPS_ONLY,
+    VERDICT,
+    Ledger,
+    Verdict,
+    replicated,
+    split_id,
+    topic_of,
+)
 from runner.refusals import Refusals
 from runner.shared_memory import YOUNG_SECONDS, sweep
 from runner.tap import Tap
@@ -73,6 +85,8 @@ class Manifest(msgspec.Struct, frozen=True):
     """None on loopback."""
     secret: str = ""
     """Of the run's bus."""
+    steps_only: bool = False
+    """Record no messages."""
 
 
 def topic(kind: type[Message]) -> Topic:
@@ -89,6 +103,7 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
         "name": graph["name"],
         "seed": str(graph["seed"]),
         "settings": json.dumps(manifest.settings),
+        "records": STEPS_ONLY if manifest.steps_only else "messages and steps",
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "revision": revision(),
         "packages": json.dumps(packages),
@@ -114,6 +129,7 @@ class RecordingWriter:
         ``refuse`` is told, on the writer's thread, of each payload that is not recorded.
         """
         self._refuse = refuse
+        self._steps_only = manifest.steps_only
         self._topics = manifest.topics
         self._file = _create(Path(manifest.path))
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
@@ -276,6 +292,8 @@ class RecordingWriter:
         self._writer.finish()
 
     def _verdict(self) -> Verdict:
+        if self._steps_only:
+            return Verdict(False, (), "; ".join([STEPS_ONLY, *self._problems]))
         problems = list(self._problems)
         reason = "" if self._problems else ": the disk was too slow"
         problems += [f"{self._dropped} payloads dropped{reason}"] if self._dropped else []
@@ -303,6 +321,7 @@ class Recorder:
     def __init__(self, manifest: Manifest) -> None:
         """Creates the recording; raises Refused where that fails."""
         self._ends: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._steps_only = manifest.steps_only
         self._bus = Bus(manifest.run, secret=manifest.secret, connect=manifest.endpoint, network=manifest.network)
         self._writer = RecordingWriter(manifest, self._complain)
         self._tap = Tap(self._bus)
@@ -317,7 +336,8 @@ class Recorder:
     def run(self) -> Verdict:
         """Records until it is stopped."""
         self._echo.start()
-        self._bus.subscribe("m/**", self._on_message)
+        if not self._steps_only:
+            self._bus.subscribe("m/**", self._on_message)
         self._bus.subscribe("s/*", self._on_step)
         self._bus.subscribe("l/*", self._on_log)
         self._bus.watch(self._on_presence, self._refusals.refuse)
@@ -419,7 +439,7 @@ def main() -> int:
     signal.signal(ORPHANED, lambda *_: recorder.stop(orphaned=True))
     verdict = recorder.run()
     print(f"{manifest.path}: {verdict}", file=sys.stderr, flush=True)
-    return 0 if verdict.complete else EXIT_INCOMPLETE
+    return 0 if verdict.complete or manifest.steps_only else EXIT_INCOMPLETE
 
 
 if __name__ == "__main__":

@@ -28,6 +28,8 @@ LOG = "log/"
 RUN = "run"
 """Name of the metadata that says what ran where."""
 VERDICT = "verdict"
+STEPS_ONLY = "steps only"
+"""Of a run that was asked to record no messages."""
 MOST_GAPS = 100_000
 """Ids named where sequences have gaps: one that claims an absurd number must not take all memory."""
 OPEN_CHUNKS = 8
@@ -287,8 +289,19 @@ class Recording:
                     envelopes.setdefault(sealed.id, sealed)
         return envelopes
 
+    def require_messages(self) -> None:
+        """Raises Refused where the run was asked to record none."""
+        if self._steps_only:
+            raise Refused(f"{self.path}: holds no messages (runner up --steps-only): no stage can be executed again")
+
+    @property
+    def _steps_only(self) -> bool:
+        return self.run.get("records") == STEPS_ONLY
+
     def _missing(self) -> tuple[str, ...]:
         """What the journal and the sequences name, and what the recorder could not keep."""
+        if self._steps_only:
+            return ()
         ledger = Ledger(replicated(self.graph))
         for id in _ids(self.metadata.get(VERDICT, {}).get("missing", "")):
             ledger.lost(id)

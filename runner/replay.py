@@ -41,6 +41,7 @@ def changed_graph(recording: Recording, assignments: Sequence[str]) -> str:
 def plan(path: Path, say: Say) -> int:
     """Says what a replay would execute."""
     recording = Recording(path)
+    recording.require_messages()
     graph = graph_from_json(json.dumps(recording.graph), str(path))
     say(f"{path}: {recording.verdict}")
     for line in _plan(recording, graph):
@@ -71,6 +72,7 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: 
     """
     began = time.perf_counter()
     recording = Recording(path)
+    recording.require_messages()
     origin = Origin(recording)
     for line in origin.lines():
         say(line)

@@ -41,7 +41,8 @@ from runner.terminal import Terminal
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
-RECORDER_GRACE_SECONDS = 2.5
+RECORDER_GRACE_SECONDS = 30.0
+"""What the recorder may take to write what waits for the disk."""
 TICK_SECONDS = 0.05
 DUMP_SECONDS = 0.5
 """What a hung process gets to print where it hangs before it is killed."""
@@ -65,13 +66,24 @@ class End:
 class Supervisor:
     """One run of a graph."""
 
-    def __init__(self, graph: Graph, *, file: Path, recordings: Path, settings: tuple[str, ...], terminal: Terminal):
+    def __init__(
+        self,
+        graph: Graph,
+        *,
+        file: Path,
+        recordings: Path,
+        settings: tuple[str, ...],
+        terminal: Terminal,
+        steps_only: bool = False,
+    ):
         """Makes the folder of the run and lists it; raises Refused where that is not possible.
 
-        ``file`` is where the graph was read from. Where it names hosts, this machine is the head.
+        ``file`` is where the graph was read from. Where it names hosts, this machine is the head. With ``steps_only``
+        no messages are recorded.
         """
         self._graph = graph
         self._settings = settings
+        self._steps_only = steps_only
         self._terminal = terminal
         self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._run, self.recording = _new_recording(recordings, graph.name)
@@ -228,6 +240,7 @@ class Supervisor:
             topics,
             network=self._network,
             secret=self._secret,
+            steps_only=self._steps_only,
         )
         return self._spawn(Process(RECORDER, 0), "runner.recorder", msgspec.json.encode(task))
 
@@ -249,7 +262,7 @@ class Supervisor:
             consumed=tuple(progress.consumed),
             network=self._network,
             secret=self._secret,
-            past=str(self.recording.absolute()) if self._relives(process) else "",
+            past=str(self.recording.absolute()) if process.incarnation > 0 and self._remembers(process.stage) else "",
         )
         host = self._graph.host_of(process.stage, process.replica)
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
@@ -263,9 +276,9 @@ class Supervisor:
     def _watch_of(self, process: Process) -> Watch:
         return Watch(self._graph.nodes[process.stage].limits)
 
-    def _relives(self, process: Process) -> bool:
-        kind = self._graph.nodes[process.stage].type.cls
-        return kind.stateful and not kind.device and process.incarnation > 0
+    def _remembers(self, stage: str) -> bool:
+        kind = self._graph.nodes[stage].type.cls
+        return kind.stateful and not kind.device
 
     def _spawn(self, process: Process, module: str, task: bytes) -> Child:
         log = self._log_of(process)
@@ -349,7 +362,9 @@ class Supervisor:
             self._say(f"{name} was {ASKED}", "info")
             self._mourn(child, ASKED, child.crashes)
             return None
-        budget = self._graph.nodes[process.stage].restarts
+        # What a stage remembers is rebuilt from recorded messages.
+        forgets = self._steps_only and self._remembers(process.stage)
+        budget = 0 if forgets else self._graph.nodes[process.stage].restarts
         if (process.stage, process.replica) in self._absent or child.crashes >= budget:
             when = "at start-up" if (process.stage, process.replica) in self._absent else f"after {budget} restarts"
             self._show_output(child)
@@ -395,8 +410,8 @@ class Supervisor:
         self._stopping.set()
         self._calls.close()
         end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
-        last = [child for child in (self._recorder, self._viewer) if child is not None]
-        end_all(last, RECORDER_GRACE_SECONDS)
+        end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
+        end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
         self._bus.close()
         sweep()
         self._registration.close()

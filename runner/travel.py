@@ -50,6 +50,7 @@ def travel(
     condition. Raises Refused for a message, stage or port that does not exist.
     """
     recording = Recording(path)
+    recording.require_messages()
     graph = change(recording, assignments, swaps)
     start = _start(recording, graph, until, condition)
     if start is None:

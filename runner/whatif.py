@@ -42,6 +42,7 @@ def what_if(
     nothing about them changes. Returns 0, or 1 where a handler raised. Raises Refused where the change is impossible.
     """
     recording = Recording(path)
+    recording.require_messages()
     graph = change(recording, assignments, swaps)
     names = cone_of(graph, _changed(recording, graph) | _known(graph, origins, "--from"))
     for line in (*Origin(recording).lines(), f"{path}: {recording.verdict}", *_plan(graph, names)):

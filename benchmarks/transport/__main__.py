@@ -78,8 +78,8 @@ def runner(messages: int, folder: Path, *arguments: str) -> Times:
 
 
 def unrecorded(messages: int, folder: Path) -> Times:
-    """The runner without a recording."""
-    return runner(messages, folder, "--no-recording")
+    """The runner with its journal, and no message recorded."""
+    return runner(messages, folder, "--steps-only")
 
 
 CONTENDERS: dict[str, Contender] = {

@@ -15,8 +15,10 @@ def add_commands(commands: Commands) -> None:
     where = up.add_mutually_exclusive_group()
     where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
-    up.add_argument("--view", action="store_true", help="open the viewer")
     up.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go")
+    seen = up.add_mutually_exclusive_group()
+    seen.add_argument("--view", action="store_true", help="open the viewer")
+    seen.add_argument("--steps-only", action="store_true", help="record no messages: nothing can be replayed")
     add_graph(add(commands, "check", _check, "check a graph file: keys, settings, classes and every edge's type"))
     add_graph(add(commands, "graph", _graph, "print a graph as a Mermaid flow chart"))
     add(commands, "schema", _schema, "print the JSON Schema of graph files")
@@ -36,7 +38,12 @@ def _up(options: argparse.Namespace) -> int:
     graph = load_graph(options.graph, settings)
     graph = graph.here() if options.here else graph
     supervisor = Supervisor(
-        graph, file=options.graph, recordings=options.recordings, settings=settings, terminal=terminal
+        graph,
+        file=options.graph,
+        recordings=options.recordings,
+        settings=settings,
+        terminal=terminal,
+        steps_only=options.steps_only,
     )
     end = supervisor.run(view=options.view)
     terminal.plain(end.reason)

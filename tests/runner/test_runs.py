@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from runner.bus import Bus
+from runner.contract import Refused
 from runner.recording import Recording
+from runner.replay import verify
 
 HERE = Path(__file__).parent
 TOYS = HERE / "toys.yaml"
@@ -206,3 +208,13 @@ def test_a_slow_consumer_holds_its_publisher_back(tmp_path: Path):
     order = [step.handler for step in Recording(slow.recording).steps if step.stage in ("counter", "doubler")]
     ahead = [order[:end].count("source") - order[:end].count("on_number") for end in range(len(order))]
     assert max(ahead) <= 6  # a queue of 4, one being published and one in work
+
+
+def test_a_run_that_records_steps_only_says_so_and_cannot_be_replayed(tmp_path: Path):
+    done = finish(start(DOUBLES, tmp_path, flags=("--steps-only",)), tmp_path)
+    recording = Recording(done.recording)
+    assert done.code == 0
+    assert (len(recording.messages), str(recording.verdict)) == (0, "INCOMPLETE: steps only")
+    assert {step.stage for step in recording.steps} == {"counter", "doubler", "sink"}
+    with pytest.raises(Refused, match="holds no messages"):
+        verify(done.recording, (), workers=1, say=print)
