@@ -171,28 +171,29 @@ class Bus:
 
     def publish(self, path: str, payload: Payload) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run."""
-        publisher = self._publishers.get(path)
-        if publisher is None:
-            publisher = self._session.declare_publisher(
-                f"{self._run}/{path}",
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                reliability=zenoh.Reliability.RELIABLE,
-            )
-            self._publishers[path] = publisher
-        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path)))
+        publisher = self._publishers.get(path) or self._declare(path, zenoh.CongestionControl.BLOCK)
+        publisher.put(payload, attachment=self._attachment(path))
 
     def offer(self, path: str, payload: bytes) -> None:
         """Sends to whoever listens, and to nobody who would have to be waited for."""
-        publisher = self._publishers.get(path)
-        if publisher is None:
-            publisher = self._session.declare_publisher(
-                f"{self._run}/{path}",
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-            self._publishers[path] = publisher
+        publisher = self._publishers.get(path) or self._declare(
+            path, zenoh.CongestionControl.DROP, zenoh.Priority.DATA_LOW
+        )
         if cast("Any", publisher).matching_status.matching:
-            publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path)))
+            publisher.put(payload, attachment=self._attachment(path))
+
+    def _declare(
+        self, path: str, congestion: zenoh.CongestionControl, priority: zenoh.Priority = zenoh.Priority.DATA
+    ) -> zenoh.Publisher:
+        reliable = zenoh.Reliability.RELIABLE
+        publisher = self._session.declare_publisher(
+            f"{self._run}/{path}", congestion_control=congestion, priority=priority, reliability=reliable
+        )
+        self._publishers[path] = publisher
+        return publisher
+
+    def _attachment(self, path: str) -> bytes:
+        return _SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path))
 
     def subscribe(
         self, path: str, callback: Callable[[Packet], None], *, first: Callable[[Packet], None] | None = None

@@ -1,6 +1,7 @@
 """The process of one stage: takes messages in, runs steps, sends what they emit and journals them."""
 
 import contextlib
+import gc
 import itertools
 import os
 import queue
@@ -114,6 +115,7 @@ class Host:
         """Serves until it is stopped; raises what a handler raises."""
         self._connect()
         expected = {*self._task.processes, (RECORDER, 0)}
+        gc.freeze()  # what set-up has made stays: no collection need look at it again
         if self._presence.wait_for(expected, self._stopping.is_set):
             self._start()
             self._serve()

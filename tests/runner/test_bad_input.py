@@ -23,8 +23,9 @@ from runner.recording import Recording
 from runner.refusals import Refusals
 from tests.runner.survivors import Picture
 from tests.runner.test_runs import TOYS, finish, processes_of, read_until, run, start
-from tests.runner.test_survival import ALBUM, changed, wait_until
+from tests.runner.test_survival import ALBUM, changed
 from tests.runner.toys import Answer
+from tests.runner.waiting import wait_until
 
 MESSAGES = 10_000
 KEYS = (

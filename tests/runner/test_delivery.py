@@ -1,8 +1,6 @@
 """A publisher keeps what is not acknowledged, hands parts of the dead to the living and waits when it must."""
 
 import threading
-import time
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -12,6 +10,7 @@ from runner.bus import Process
 from runner.codec import Envelope
 from runner.delivery import PREFETCH, Delivery, Stopped
 from runner.graph import Route
+from tests.runner.waiting import wait_until
 
 
 class Wire:
@@ -31,13 +30,6 @@ class Wire:
     def take(self) -> list[tuple[int, str]]:
         sent, self.sent = self.sent, []
         return sent
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def make(**changes: Any) -> tuple[Delivery, Wire]:

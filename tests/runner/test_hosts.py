@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from runner.network import Host
 from runner.recording import Recording
 from tests.runner.machines import HOSTS, NAMES, Machines, Party, in_namespaces, on_loopback, run_here
 from tests.runner.test_runs import Run, processes_of, read_until
+from tests.runner.waiting import wait_until
 
 SUMS = """
 name: sums
@@ -80,13 +80,6 @@ def assert_same_result(head: Run, here: Run) -> None:
     assert Recording(head.recording).verdict.complete
     assert (head.folder.parent / "out.txt").read_text() == (here.folder / "out.txt").read_text()
     assert bodies(head) == bodies(here)
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 30) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return condition()
 
 
 # ---------------------------------------------------------------------------------------------- on loopback
@@ -170,7 +163,7 @@ def test_hosts_end_with_their_head(parties, tmp_path: Path):
     for name in NAMES[1:]:
         ended = party.end(name)
         assert (ended.code, "the connection to head is gone" in ended.output) == (1, True), ended.output
-    assert wait_until(lambda: processes_of(tmp_path) == [])
+    wait_until(lambda: processes_of(tmp_path) == [])
 
 
 def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixture[str]):

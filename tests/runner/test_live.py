@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
@@ -33,6 +33,7 @@ from runner.tables import show_progress
 from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
+from tests.runner.waiting import wait_until
 
 ACCOUNT = HERE / "account.yaml"
 
@@ -90,13 +91,6 @@ def runner(*arguments: str) -> subprocess.CompletedProcess[str]:
     """A command as a user types it."""
     command = [sys.executable, "-m", "runner.cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 30) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it never came true"
-        time.sleep(0.05)
 
 
 # ------------------------------------------------------------------------------------------ questions
@@ -169,7 +163,7 @@ def test_a_supervisor_that_was_killed_is_struck_off_the_list(tmp_path: Path) -> 
     assert run.entry in runs()
     run.process.kill()
     run.process.communicate()
-    wait_for(lambda: run.entry not in runs())
+    wait_until(lambda: run.entry not in runs())
 
 
 # ------------------------------------------------------------------------------------------ status
@@ -178,7 +172,7 @@ def test_a_supervisor_that_was_killed_is_struck_off_the_list(tmp_path: Path) -> 
 def test_a_run_says_how_its_processes_are(account: Run) -> None:
     with Live(account.entry) as live:
         live.wait_until_ready()
-        wait_for(lambda: all(process.pulse and process.sent for process in live.status().processes[1:]))
+        wait_until(lambda: all(process.pulse and process.sent for process in live.status().processes[1:]))
         status = live.status()
     assert [process.name for process in status.processes] == ["recorder", "counter", "account"]
     assert {process.state for process in status.processes} <= {"waiting", "working", "held back"}
@@ -193,10 +187,10 @@ def test_a_process_that_stands_still_is_silent(account: Run) -> None:
         live.wait_until_ready()
         os.kill(pid, signal.SIGSTOP)
         try:
-            wait_for(lambda: "silent" in [process.state for process in live.status().processes])
+            wait_until(lambda: "silent" in [process.state for process in live.status().processes])
         finally:
             os.kill(pid, signal.SIGCONT)
-        wait_for(lambda: "silent" not in [process.state for process in live.status().processes])
+        wait_until(lambda: "silent" not in [process.state for process in live.status().processes])
 
 
 # ------------------------------------------------------------------------------------------ commands
@@ -304,7 +298,7 @@ def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) ->
     with Live(run.entry) as live:
         with pytest.raises(Refused, match=r"no process 'worker'; did you mean 'worker.1'"):
             live.restart("worker")
-        wait_for((tmp_path / "out.txt").exists)
+        wait_until((tmp_path / "out.txt").exists)
         assert re.fullmatch(r"worker.1 is back: process \d+, ready after \d+\.\d s", live.restart("worker.1"))
         worker = next(process for process in live.status().processes if process.name == "worker.1")
         assert (worker.restarts, worker.reason) == (1, "asked to restart")
@@ -493,7 +487,7 @@ def test_completion_is_printed_for_a_shell(shell: str, word: str) -> None:
 
 def test_log_lines_of_a_run_and_its_end_in_order(account: Run) -> None:
     assert runner("call", "account", "add", "amount=2").stdout.splitlines()[0].endswith("account          2 added")
-    wait_for(lambda: "2 added" in runner("logs", "account").stdout)
+    wait_until(lambda: "2 added" in runner("logs", "account").stdout)
     follower = subprocess.Popen(
         [sys.executable, "-m", "runner.cli", "logs", "-f"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import zenoh
 from runner.bus import Bus, Process, Router, _badge, free_endpoint
 from runner.keys import add_keys, credentials, make_keys
 from runner.network import Credentials, Host, Network
+from tests.runner.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")
 PIECE = "d/worker/0/piece"
@@ -122,13 +123,6 @@ def succeeded(table: Table, peer: Peer) -> bool:
     return published and seen and b"number" in peer.heard and b"up" in peer.answers
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 30) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return condition()
-
-
 def test_a_host_of_the_graph_does_all_of_it(table: Table, keys: Path):
     own = credentials(keys, "worker2")
     with call_in(table.endpoint, own, own.ca) as session:
@@ -146,7 +140,7 @@ def test_anybody_else_does_nothing_of_it(table: Table, keys: Path, foreign_keys:
         peer = try_everything(table, session, seconds=2)
         own = {f"run/{STRANGER}"}
         assert (peer.heard, set(peer.seen) - own, peer.answers) == ([], set(), [])
-        assert wait_until(lambda: (NUMBER, b"number") in table.arrived)
+        wait_until(lambda: (NUMBER, b"number") in table.arrived)
         assert (PIECE, b"piece") not in table.arrived
         assert STRANGER not in table.present
         assert b"stranger" not in table.asked
@@ -175,7 +169,7 @@ def test_only_the_head_gives_orders(keys: Path):
         head.publish("order/worker1/1", b"from the head")
         return b"from the head" in orders and b"from worker2" in reports
 
-    assert wait_until(all_arrived)
+    wait_until(all_arrived)
     assert set(orders) == {b"from the head"}
     for bus in (other, worker, head):
         bus.close()

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,7 @@ import pytest
 from runner.recording import Recording
 from tests.runner.test_replay import verify
 from tests.runner.test_runs import DOUBLES, HERE, TOYS, Run, finish, processes_of, read_until, run, start
+from tests.runner.waiting import wait_until
 
 ALBUM = HERE / "album.yaml"
 ENDLESS = ("counter.count=100000", "counter.period=0.005", "sink.count=100000")
@@ -29,13 +30,6 @@ def changed(source: Path, folder: Path, **changes: str) -> Path:
     path = folder / source.name
     path.write_text(text)
     return path
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def pid_of(folder: Path, name: str) -> int:
