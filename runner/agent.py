@@ -37,7 +37,6 @@ from runner.hosts import (
 )
 from runner.network import read_layout
 from runner.provenance import revision
-from runner.shared_memory import sweep
 from runner.terminal import Terminal
 
 ASK_SECONDS = 15.0
@@ -85,7 +84,6 @@ class Agent:
         finally:
             self._end_all()
             bus.close()
-            sweep()
 
     def _take_part(self, bus: Bus) -> Dismiss:
         bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)

@@ -272,7 +272,6 @@ def _check_items(check: Check | None) -> Check | None:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
-_NOTHING = msgspec.Raw(b"\xc0")
 
 
 @cache
@@ -316,14 +315,6 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
 def pack(record: Envelope | Step | Receipt | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike."""
     return _encoder().encode(record)
-
-
-def pack_in_parts(sealed: Envelope) -> tuple[bytes, bytes]:
-    """The bytes of :func:`pack` as head and body, of which the second is not copied where it was just encoded."""
-    head = pack(msgspec.structs.replace(sealed, body=_NOTHING))[:-1]
-    body = memoryview(sealed.body)
-    whole = body.obj
-    return head, whole if isinstance(whole, bytes) and len(whole) == len(body) else bytes(body)
 
 
 def unpack(kind: type[R], payload: bytes) -> R:

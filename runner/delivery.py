@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from runner.bus import Payload, Process
+from runner.bus import Process
 from runner.codec import Envelope
 from runner.graph import Route
 
@@ -16,7 +16,7 @@ POLL_SECONDS = 0.1
 PATIENCE_SECONDS = 30.0
 """A publisher that is held back for longer says so."""
 
-Send = Callable[[str, Payload], None]
+Send = Callable[[str, bytes], None]
 """Publishes on a path of the bus."""
 Warn = Callable[[str], None]
 
@@ -31,7 +31,7 @@ class _Entry:
 
     id: str
     lineage: str
-    payload: Payload
+    payload: bytes
     replica: int | None = None
     """Who has been given this part."""
     received: bool = False
@@ -43,11 +43,11 @@ class Courier:
 
     def __init__(self, send: Send):
         self._send = send
-        self._waiting: dict[str, Payload] = {}
+        self._waiting: dict[str, bytes] = {}
         self._changed = threading.Condition()
         threading.Thread(target=self._send_all, name="courier", daemon=True).start()
 
-    def take(self, path: str, payload: Payload) -> None:
+    def take(self, path: str, payload: bytes) -> None:
         """Sends soon; what waits on the same path is left out."""
         with self._changed:
             self._waiting[path] = payload
@@ -173,7 +173,7 @@ class Delivery:
         self._newest: dict[tuple[str, int], Process] = {}
         """The newest process seen of each replica."""
 
-    def publish(self, port: str, envelope: Envelope, payload: Payload) -> None:
+    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
         """Hands a message to every consumer of a port; blocks while one's queue is full. Raises Stopped."""
         for edge in self._edges:
             if edge.route.output == port:

@@ -298,7 +298,7 @@ class Host:
 
     def _emit(self, envelope: Envelope) -> None:
         """Sends a message, to the recorder first."""
-        payload = self._bus.load(*codec.pack_in_parts(envelope))
+        payload = codec.pack(envelope)
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)

@@ -39,7 +39,6 @@ from runner.recording import (
     topic_of,
 )
 from runner.refusals import Refusals
-from runner.shared_memory import YOUNG_SECONDS, sweep
 from runner.tap import Tap
 
 FLUSH_SECONDS = 0.25
@@ -351,11 +350,7 @@ class Recorder:
         self._echoes.put(None)
         self._echo.join(FLUSH_SECONDS)
         self._bus.close()
-        verdict = self._writer.close()
-        if orphaned:  # nobody else is left to tidy up
-            time.sleep(YOUNG_SECONDS)
-            sweep()
-        return verdict
+        return self._writer.close()
 
     def stop(self, *, orphaned: bool = False) -> None:
         """Ends :meth:`run` after what has arrived; ``orphaned`` because the supervisor died. May be called from a

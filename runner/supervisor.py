@@ -35,7 +35,6 @@ from runner.ports import port_name
 from runner.recorder import Manifest, topic
 from runner.refusals import Refusals, admit, require_genuine
 from runner.registry import Entry, Registration, runs
-from runner.shared_memory import sweep
 from runner.status import ProcessStatus, Rates, RunStatus, topics_of
 from runner.terminal import Terminal
 
@@ -123,13 +122,13 @@ class Supervisor:
         self._numbering = threading.Lock()
         self._calls = Calls(graph, self._publish)
         self._absent = set(graph.processes())
+        self._was_ready = False
 
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
-        sweep()
         self._connect()
         self._terminal.show(SUPERVISOR, f"run {self._run} on {self._endpoint}")
         try:
@@ -212,6 +211,7 @@ class Supervisor:
         self._presence.update(process, present)
         if present and self._recorder is not None and process == self._recorder.process:
             self._recorder.announced = True
+            self._say_when_all_are_ready()
         child = self._children.get((process.stage, process.replica))
         if not present or child is None or child.process != process:
             return
@@ -219,7 +219,11 @@ class Supervisor:
         child.announced = True
         self._terminal.show(self._name_of(process.stage, process.replica), f"ready after {child.ready_after:.1f} s")
         self._absent.discard((process.stage, process.replica))
-        if not self._absent and not process.incarnation:
+        self._say_when_all_are_ready()
+
+    def _say_when_all_are_ready(self) -> None:
+        if not self._was_ready and self._is_ready():
+            self._was_ready = True
             self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
 
     # ------------------------------------------------------------------------------------------ processes
@@ -413,7 +417,6 @@ class Supervisor:
         end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
         end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
         self._bus.close()
-        sweep()
         self._registration.close()
         return "" if self._recorder is None else self._recorder.reason()
 
