@@ -297,13 +297,15 @@ class Host:
             yield True
 
     def _emit(self, envelope: Envelope) -> None:
-        """Sends a message, to the recorder first."""
+        """Sends a message: to those who wait for it, then to the recorder, also where the graph ends meanwhile."""
         payload = codec.pack(envelope)
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
-        self._bus.publish(f"m/{self._process.stage}/{port}", payload)
-        self._delivery.publish(port, envelope, payload)
+        try:
+            self._delivery.publish(port, envelope, payload)
+        finally:
+            self._bus.publish(f"m/{self._process.stage}/{port}", payload)
 
     def _journal(self, record: "_Record") -> None:
         step = record.step(self._process, self._steps)
