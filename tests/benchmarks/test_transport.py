@@ -1,0 +1,38 @@
+"""The pace that all contenders keep, and the table of what was timed."""
+
+from pathlib import Path
+
+from benchmarks.recording_stages import Pace, beats
+from benchmarks.starts import cold_start
+from benchmarks.transport import schedule
+from benchmarks.transport.__main__ import lines
+from benchmarks.transport.schedule import SIZES, WARM_UP, Schedule
+
+
+def test_every_size_is_sent_as_often_as_wanted_and_warm_up_is_left_out(monkeypatch):
+    monkeypatch.setattr(schedule, "PAUSES", (0.0,) * len(SIZES))
+    course, sent = Schedule(5), []
+    while not course.done:
+        data = course.pause()
+        course.sent_ns = 1_000
+        sent.append(len(data))
+        course.arrived(3_000)
+    assert [sent.count(size) for size in SIZES] == [WARM_UP + 5] * 4 + [WARM_UP + 1]
+    assert course.microseconds[str(SIZES[0])] == [2.0] * 5
+
+
+def test_the_table_shows_medians_over_rounds_and_ratios_to_bare_zenoh():
+    def times(value: float) -> dict[str, list[float]]:
+        return {str(size): [value] * 3 for size in SIZES}
+
+    table = lines({"bare zenoh": [times(10), times(10), times(90)], "runner": [times(13), times(12), times(80)]})
+    assert len(table) == 1 + len(SIZES)
+    assert "13 /       13 ( 1.30x)" in table[1]
+
+
+def test_beats_come_in_number():
+    assert list(beats(Pace(hertz=1000, seconds=0.01))) == list(range(10))
+
+
+def test_a_cold_start_loses_nothing(tmp_path: Path):
+    assert cold_start(tmp_path)
