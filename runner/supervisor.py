@@ -318,6 +318,7 @@ class Supervisor:
             if child.handle.poll() and child.heir is None:
                 name = self._name_of(child.process.stage, child.process.replica)
                 self._say(f"{name} died meanwhile: {child.reason(self._pulses.of(child.process))}", "warning")
+                self._show_output(child)
 
     def _look_after_children(self) -> End | None:
         if self._recorder is not None:
