@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -17,7 +18,8 @@ import time
 from pathlib import Path
 from statistics import median
 
-from runner.graph import Graph, load_graph
+from runner.children import ENVIRONMENT
+from runner.graph import Graph, load_graph, node_entry
 from runner.recording import Recording
 
 _GRAPH = Path(__file__).parents[1] / "graph.yaml"
@@ -42,12 +44,13 @@ def seconds_to_ready(graph: Path, folder: Path) -> float:
 def seconds_to_construct(graph: Graph) -> float:
     """Wall time to import and set up every stage of a graph, each in a process, all at once and without a runner."""
     code = (
-        "import sys; from pathlib import Path; from runner.graph import load_graph;"
-        "load_graph(Path(sys.argv[1])).nodes[sys.argv[2]].construct()"
+        "import json, sys; from runner.graph import node_from_entry;"
+        "node_from_entry(sys.argv[1], json.loads(sys.argv[2])).construct()"
     )
     began = time.monotonic()
-    names = [node.name for node in graph.nodes.values() for _ in range(node.replicas)]
-    children = [subprocess.Popen([sys.executable, "-c", code, str(_GRAPH), name]) for name in names]
+    tasks = [(node.name, json.dumps(node_entry(node))) for node in graph.nodes.values() for _ in range(node.replicas)]
+    environment = {**os.environ, **ENVIRONMENT}
+    children = [subprocess.Popen([sys.executable, "-c", code, *task], env=environment) for task in tasks]
     for child in children:
         child.wait()
     return time.monotonic() - began
