@@ -102,6 +102,11 @@ class Packet:
     genuine: bool = True
     """Whether it comes from a process of this run, see :func:`_badge`."""
 
+    @property
+    def end(self) -> str:
+        """The last part of its key: the port that it is delivered to, or the stage that it comes from."""
+        return self.key.rpartition("/")[2]
+
 
 _SENT = struct.Struct("<qQ8s")
 """What accompanies a message: when it was sent, by which clock, and the sender's badge."""

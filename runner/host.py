@@ -189,7 +189,7 @@ class Host:
             self._delivery.acknowledge(step.stage, step.consumed)
 
     def _on_receipt(self, packet: Packet) -> None:
-        receipt, consumer = self._refusals.read(Receipt, packet), packet.key.rpartition("/")[2]
+        receipt, consumer = self._refusals.read(Receipt, packet), packet.end
         if receipt is not None and receipt.consumed:
             self._delivery.acknowledge(consumer, [(receipt.port, receipt.id)])
         elif receipt is not None:
@@ -197,7 +197,7 @@ class Host:
 
     def _hand_over(self, packet: Packet) -> None:
         """To the thread that runs steps, before anything else is done about it; then comes :meth:`_on_delivery`."""
-        port = _port_of(packet)
+        port = packet.end
         with contextlib.suppress(CodecError):  # what is malformed is refused by who takes it
             id = admit(Envelope, packet).id
             self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
@@ -210,7 +210,7 @@ class Host:
 
     def _take(self, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
-        name = _port_of(packet)
+        name = packet.end
         try:
             envelope = codec.unpack(Envelope, packet.payload)
             if packet.genuine and (name, envelope.id) in self._arrived:
@@ -402,10 +402,6 @@ class _Record:
             outcome=self.outcome,
             error=self.error,
         )
-
-
-def _port_of(packet: Packet) -> str:
-    return packet.key.rpartition("/")[2]
 
 
 def _summary(error: Exception) -> str:

@@ -30,7 +30,7 @@ class Mailbox:
 
     def put(self, packet: Packet) -> None:
         """Takes a packet from the link's thread."""
-        port = packet.key.rpartition("/")[2]
+        port = packet.end
         if port not in self._latest or not packet.genuine:
             if port in self._come:
                 self._come[port] += 1
@@ -52,7 +52,7 @@ class Mailbox:
         if isinstance(item, str):
             with self._exchanging:
                 return self._newest.pop(item)
-        if item is not None and (port := item.key.rpartition("/")[2]) in self._fetched:
+        if item is not None and (port := item.end) in self._fetched:
             self._fetched[port] += 1
         return item
 

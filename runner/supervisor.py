@@ -176,7 +176,7 @@ class Supervisor:
     def _on_receipt(self, packet: Packet) -> None:
         receipt = self._refusals.read(Receipt, packet)
         if receipt is not None and receipt.consumed:
-            self._delivery.acknowledge(packet.key.rpartition("/")[2], [(receipt.port, receipt.id)])
+            self._delivery.acknowledge(packet.end, [(receipt.port, receipt.id)])
 
     def _on_log(self, packet: Packet) -> None:
         line = self._refusals.read(LogLine, packet)
@@ -339,7 +339,6 @@ class Supervisor:
         for child in self._children.values():
             if hosts.waits(child.process):
                 child.started, child.watch = time.monotonic(), self._watch_of(child.process)
-                child.watch = Watch(self._graph.nodes[child.process.stage].limits)
         hosts.remind()
         reason = hosts.overdue(self._graph.hosts_of_stages())
         return None if reason is None else End(1, reason)
