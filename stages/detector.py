@@ -48,7 +48,8 @@ class Detector(Stage):
     def __init__(self, config: Config) -> None:
         # Sums over several threads are added in another order, which a replay would show as a difference.
         torch.set_num_threads(1)
-        torch.use_deterministic_algorithms(True)
+        # As use_deterministic_algorithms(True), which loads torch's compiler first and takes a second for it.
+        torch.set_deterministic_debug_mode("error")
         self._config = config
         self._network = DetectionNetwork.load(config.weights)
         unknown = sorted(set(config.labels) - set(self._network.labels))

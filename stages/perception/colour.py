@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from stages.perception.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats, Mesh
+from stages.scene.distinct import distinct_rows
 
 _SPACING = 0.002
 """Metres between samples of a painted surface."""
@@ -66,7 +67,7 @@ class Paint:
     def of(mesh: Mesh) -> Paint:
         """Samples every triangle about every 2 mm; colours are interpolated between its corners."""
         points, colors = _samples(mesh)
-        _, first = np.unique(np.round(points / (0.5 * _SPACING)).astype(np.int64), axis=0, return_index=True)
+        first, _ = distinct_rows(np.round(points / (0.5 * _SPACING)).astype(np.int64))
         return Paint(KDTree(points[first]), cielab(colors[first]))
 
     def at(self, points: Floats) -> Floats:
@@ -242,10 +243,16 @@ def _samples(mesh: Mesh) -> tuple[Floats, Floats]:
     points: list[Floats] = []
     paints: list[Floats] = []
     for n in np.unique(parts):
-        weights = _barycentric(int(n))[None, :, :, None]
-        points.append((weights * corners[parts == n][:, None]).sum(2).reshape(-1, 3))
-        paints.append((weights * colors[parts == n][:, None]).sum(2).reshape(-1, 3))
+        weights, chosen = _barycentric(int(n)), parts == n
+        points.append(_interpolated(weights, corners[chosen]))
+        paints.append(_interpolated(weights, colors[chosen]))
     return np.concatenate(points), np.concatenate(paints)
+
+
+def _interpolated(weights: Floats, corners: Floats) -> Floats:
+    """Means of three corners' values (F x 3 x 3) with each of the weights (N x 3), F N x 3."""
+    first, second, third = (weights[:, k, None] * corners[:, None, k] for k in range(3))
+    return (first + second + third).reshape(-1, 3)
 
 
 def _barycentric(n: int) -> Floats:

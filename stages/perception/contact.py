@@ -32,6 +32,10 @@ _TOUCH = 0.0003
 _SLOPE = 0.5
 """A surface carries something if its normal rises by this share of its length."""
 _FAR = 10.0
+_HALF = 0.5001 * np.sqrt(3.0)
+"""Half the diagonal of a cell, and a little more."""
+_ON = 1e-6
+"""Metres from the surface within which rounding decides the side."""
 _f = np.float32
 
 
@@ -221,40 +225,137 @@ def _distance(grid, x, y, z):
 def _fill_grid(triangles, low, spacing, grid):
     """Signed distances of every node: distance to the nearest triangle, inside where the winding number says so.
 
-    Along a row the sign can only change where the surface is nearer than the next node, and the distance grows by a
-    cell at most, so that most nodes test few triangles.
+    Along a row the sign can only change where the surface is nearer than the next node.
     """
-    count = triangles.shape[0]
-    middle = np.empty((count, 3))
-    radius = np.empty(count)
-    for t in range(count):
-        radius[t] = 0.0
-        for k in range(3):
-            middle[t, k] = (triangles[t, 0, k] + triangles[t, 1, k] + triangles[t, 2, k]) / 3.0
-        for c in range(3):
-            s = 0.0
-            for k in range(3):
-                s += (triangles[t, c, k] - middle[t, k]) ** 2
-            radius[t] = max(radius[t], np.sqrt(s))
+    distances = np.empty(grid.shape)
+    _fill_distances(triangles, low, spacing, distances)
+    sides = np.empty((9, triangles.shape[0]))
+    for t in range(triangles.shape[0]):
+        for c in range(9):
+            sides[c, t] = triangles[t, c // 3, c % 3]
     p = np.empty(3)
     for i in range(grid.shape[0]):
         for j in range(grid.shape[1]):
             before, inside = 1e9, False
             for k in range(grid.shape[2]):
-                p[0], p[1], p[2] = low[0] + i * spacing, low[1] + j * spacing, low[2] + k * spacing
-                bound = 1.0001 * (before + spacing)
-                best = bound * bound
-                for t in range(count):
-                    away = 0.0
-                    for c in range(3):
-                        away += (p[c] - middle[t, c]) ** 2
-                    if np.sqrt(away) - radius[t] < np.sqrt(best):
-                        best = min(best, _squared_distance(p, triangles[t]))
-                distance = np.sqrt(best)
+                distance = distances[i, j, k]
                 if k == 0 or before <= spacing:
-                    inside = _winding(p, triangles) > 0.5
+                    p[0], p[1], p[2] = low[0] + i * spacing, low[1] + j * spacing, low[2] + k * spacing
+                    inside = _is_inside(p, triangles, sides, distance)
                 before = distance
                 grid[i, j, k] = -distance if inside else distance
+
+
+@numba.njit(**INLINED)
+def _fill_distances(triangles, low, spacing, distances):
+    """Distance of every node to the nearest triangle, by blocks of 4 x 4 x 4 nodes and blocks of 2 x 2 x 2 in them.
+
+    Only triangles that are nearly as near to the middle of a block as the nearest one can be the nearest of a node in
+    it: two points' distances to a triangle differ by no more than the way between them.
+    """
+    count = triangles.shape[0]
+    everything, spheres = np.arange(count), _spheres(triangles)
+    some, few, away = np.empty(count, np.intp), np.empty(count, np.intp), np.empty(count)
+    middle, p = np.empty(3), np.empty(3)
+    wide, narrow = _HALF * 3.0 * spacing, _HALF * spacing
+    for block in np.ndindex(
+        (distances.shape[0] + 3) // 4, (distances.shape[1] + 3) // 4, (distances.shape[2] + 3) // 4
+    ):
+        for c in range(3):
+            middle[c] = low[c] + (4 * block[c] + 1.5) * spacing
+        n, _ = _near(middle, triangles, everything, count, 2.0 * wide, some, away)
+        for part in np.ndindex(2, 2, 2):
+            x, y, z = 4 * block[0] + 2 * part[0], 4 * block[1] + 2 * part[1], 4 * block[2] + 2 * part[2]
+            if x >= distances.shape[0] or y >= distances.shape[1] or z >= distances.shape[2]:
+                continue
+            middle[0], middle[1], middle[2] = (
+                low[0] + (x + 0.5) * spacing,
+                low[1] + (y + 0.5) * spacing,
+                low[2] + (z + 0.5) * spacing,
+            )
+            m, nearest = _near(middle, triangles, some, n, 2.0 * narrow, few, away)
+            for i in range(x, min(x + 2, distances.shape[0])):
+                for j in range(y, min(y + 2, distances.shape[1])):
+                    for k in range(z, min(z + 2, distances.shape[2])):
+                        p[0], p[1], p[2] = low[0] + i * spacing, low[1] + j * spacing, low[2] + k * spacing
+                        distances[i, j, k] = _nearest(p, triangles, spheres, few, m, nearest + narrow)
+
+
+@numba.njit(**INLINED)
+def _near(p, triangles, among, count, slack, kept, away):
+    """Writes which of the triangles are farther from p than the nearest by no more than ``slack``, and how far."""
+    nearest = 1e9
+    for n in range(count):
+        away[n] = np.sqrt(_squared_distance(p, triangles[among[n]]))
+        nearest = min(nearest, away[n])
+    found = 0
+    for n in range(count):
+        if away[n] <= nearest + slack:
+            kept[found], away[found] = among[n], away[n]
+            found += 1
+    return found, nearest
+
+
+@numba.njit(**INLINED)
+def _nearest(p, triangles, spheres, few, count, bound):
+    """Distance to the nearest of a few triangles, none farther than ``bound``."""
+    best = bound * bound
+    for n in range(count):
+        t = few[n]
+        away = (p[0] - spheres[t, 0]) ** 2 + (p[1] - spheres[t, 1]) ** 2 + (p[2] - spheres[t, 2]) ** 2
+        if np.sqrt(away) - spheres[t, 3] < np.sqrt(best):
+            best = min(best, _squared_distance(p, triangles[t]))
+    return np.sqrt(best)
+
+
+@numba.njit(**INLINED)
+def _spheres(triangles):
+    """Middle and radius of a sphere around each triangle, T x 4."""
+    spheres = np.zeros((triangles.shape[0], 4))
+    for t in range(triangles.shape[0]):
+        for k in range(3):
+            spheres[t, k] = (triangles[t, 0, k] + triangles[t, 1, k] + triangles[t, 2, k]) / 3.0
+        for c in range(3):
+            s = 0.0
+            for k in range(3):
+                s += (triangles[t, c, k] - spheres[t, k]) ** 2
+            spheres[t, 3] = max(spheres[t, 3], np.sqrt(s))
+    return spheres
+
+
+@numba.njit(**INLINED)
+def _is_inside(p, triangles, sides, distance):
+    """Whether the winding number exceeds a half; roughly where that tells."""
+    if distance > _ON:
+        rough = _roughly_winding(p, sides)
+        if abs(rough - 0.5) > 0.1:
+            return rough > 0.5
+    return _winding(p, triangles) > 0.5
+
+
+@numba.njit(**INLINED)
+def _roughly_winding(p, sides):
+    """The winding number to 1e-5 a triangle, without a branch: the arc tangent is Abramowitz and Stegun's 4.4.47."""
+    total = 0.0
+    x, y, z = p[0], p[1], p[2]
+    for t in range(sides.shape[1]):
+        ax, ay, az = sides[0, t] - x, sides[1, t] - y, sides[2, t] - z
+        bx, by, bz = sides[3, t] - x, sides[4, t] - y, sides[5, t] - z
+        cx, cy, cz = sides[6, t] - x, sides[7, t] - y, sides[8, t] - z
+        a, b, c = (np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz),
+                   np.sqrt(cx * cx + cy * cy + cz * cz))  # fmt: skip
+        volume = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
+        ab, bc, ca = ax * bx + ay * by + az * bz, bx * cx + by * cy + bz * cz, cx * ax + cy * ay + cz * az
+        solid = a * b * c + ab * c + bc * a + ca * b
+        high, wide = abs(volume), abs(solid)
+        steep = high > wide
+        r = wide / high if steep else high / wide
+        q = r * r
+        angle = r * (0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351))))
+        angle = 0.5 * np.pi - angle if steep else angle
+        angle = np.pi - angle if solid < 0.0 else angle
+        total += angle if volume > 0.0 else -angle
+    return total / (2.0 * np.pi)
 
 
 @numba.njit(**INLINED)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,6 +96,7 @@ def symmetry_angle(A: Floats, B: Floats, symmetries: Floats) -> Floats:
     return rotation_angle(A[..., None, :, :], equivalents).min(-1)
 
 
+@cache
 def cube_rotations() -> Floats:
     """The 24 rotations of a cube, identity first, 24 x 3 x 3."""
     found: list[NDArray[np.float64]] = [np.eye(3)]

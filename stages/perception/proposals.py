@@ -20,6 +20,7 @@ from stages.perception.poses import (
 )
 from stages.perception.rasteriser import KERNEL
 from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.distinct import distinct_rows
 
 Dof = Literal[3, 6]
 _SAME = np.deg2rad(12.0)
@@ -196,7 +197,8 @@ def box_axes(vertices: Floats) -> Floats:
     length = np.sqrt((across**2).sum(1))
     first, across = first[length > 0.1], across[length > 0.1] / length[length > 0.1, None]
     frames = np.concatenate([np.eye(3)[None], np.stack([first, across, np.cross(first, across)], -1)])
-    along = (corners[None, :, :, None] * frames[:, None]).sum(2)
+    x, y, z = (corners[None, :, k, None] * frames[:, None, k] for k in range(3))
+    along = x + y + z
     volumes = (along.max(1) - along.min(1)).prod(1)
     best = int(np.argmin(volumes))
     return frames[best] if volumes[best] < _CLEARLY * volumes[0] else frames[0]
@@ -207,8 +209,8 @@ def _larger_faces(vertices: Floats, hull: ConvexHull) -> Floats:
     corners = vertices[hull.simplices]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = hull.equations[:, :3] * np.sqrt((across**2).sum(1))[:, None]
-    _, which = np.unique(np.round(hull.equations[:, :3] / _ROUGHLY), axis=0, return_inverse=True)
-    faces = np.stack([np.bincount(which.reshape(-1), component) for component in outward.T], -1)
+    _, which = distinct_rows(np.round(hull.equations[:, :3] / _ROUGHLY))
+    faces = np.stack([np.bincount(which, component) for component in outward.T], -1)
     sizes = np.sqrt((faces**2).sum(1))
     largest = np.argsort(-sizes, kind="stable")[:_FACES]
     return faces[largest] / sizes[largest, None]

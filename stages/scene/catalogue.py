@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from runner.contract import Refused
+from stages.scene.distinct import distinct_rows
 
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -162,8 +163,8 @@ def _turns(axis: Floats, offset: Floats, step: float) -> Floats:
 
 def _decimated(mesh: Mesh, triangles: int) -> Mesh:
     """Fewer triangles; vertices that a texture seam split are joined first, or the surface would tear there."""
-    _, first, inverse = np.unique(np.round(mesh.vertices * 1e7), axis=0, return_index=True, return_inverse=True)
-    points, faces = mesh.vertices[first], inverse.reshape(-1)[mesh.faces].astype(np.int32)
+    first, which = distinct_rows(np.round(mesh.vertices * 1e7))
+    points, faces = mesh.vertices[first], which[mesh.faces].astype(np.int32)
     if len(faces) <= triangles:
         return mesh
     vertices, faces = _collapsed(points, faces, triangles)

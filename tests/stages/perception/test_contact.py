@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trimesh.triangles import closest_point
 
 from stages.perception.contact import ContactForm, Contacts, Solid, apparent, contacts, penalty
 from stages.perception.poses import exp_so3, pose
@@ -28,6 +29,25 @@ def touching(placed: list[tuple[str, np.ndarray]], T_camera_table: np.ndarray | 
 
 def lifted(label: str, x: float, y: float, yaw: float, height: float) -> np.ndarray:
     return pose(np.eye(3), np.array([0.0, 0.0, height])) @ upright(label, x, y, yaw)
+
+
+@pytest.mark.parametrize("label", ["mug", "tea_box", "tray"])
+def test_the_grid_has_the_distance_and_the_side_of_every_triangle_asked(label: str) -> None:
+    """All triangles at once, and the winding number as an angle of vectors (Van Oosterom and Strackee)."""
+    grid, mesh = solid(label).grid, CATALOGUE[label].simplified(500)
+    nodes = np.random.default_rng(1).integers(0, grid.shape, (300, 3))
+    points = (CATALOGUE[label].bounds[0] - 2 * solid(label).spacing) + nodes * solid(label).spacing
+    triangles = np.tile(mesh.vertices[mesh.faces], (len(points), 1, 1))
+    queries = np.repeat(points, len(mesh.faces), 0)
+    away = np.linalg.norm(closest_point(triangles, queries) - queries, axis=1).reshape(len(points), -1).min(1)
+    a, b, c = np.moveaxis(triangles - queries[:, None], 1, 0)
+    x, y, z = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    solids = x * y * z + (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
+    winding = np.arctan2((a * np.cross(b, c)).sum(1), solids).reshape(len(points), -1).sum(1) / (2 * np.pi)
+    found = grid[tuple(nodes.T)]
+    assert np.abs(found) == pytest.approx(away, abs=1e-7)
+    off = away > 1e-6
+    assert ((found < 0) == (winding > 0.5))[off].all()
 
 
 @given(depth=st.floats(0.003, 0.02), yaw=st.floats(-3.0, 3.0))
