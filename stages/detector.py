@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.messages import Candidate, Candidates, Frame
-from stages.perception.detection_network import DetectionNetwork, Detections, detect
-from stages.scene.catalogue import Catalogue
+from stages.scene.catalogue import Catalogue, Floats
 
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
 
@@ -46,12 +44,17 @@ class Detector(Stage):
                 raise Refused(f"detector.max_boxes = {self.max_boxes}: must be at least 1")
 
     def __init__(self, config: Config) -> None:
+        # torch takes a second to load; whoever only reads a graph does without.
+        import torch
+
+        from stages.perception.detection_network import DetectionNetwork, detect
+
         # Sums over several threads are added in another order, which a replay would show as a difference.
         torch.set_num_threads(1)
         # As use_deterministic_algorithms(True), which loads torch's compiler first and takes a second for it.
         torch.set_deterministic_debug_mode("error")
         self._config = config
-        self._network = DetectionNetwork.load(config.weights)
+        self._network, self._detect = DetectionNetwork.load(config.weights), detect
         unknown = sorted(set(config.labels) - set(self._network.labels))
         if unknown:
             known = ", ".join(self._network.labels)
@@ -64,11 +67,10 @@ class Detector(Stage):
         labels = self._config.labels or self._network.labels
         columns = [self._network.labels.index(label) for label in labels]
         config = self._config
-        found = detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
+        found = self._detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
         sure = int((found.scores >= config.threshold).sum())
-        if sure >= config.expected:
-            found = Detections(found.boxes[:sure], found.confidences[:sure])
-        message = _candidates(found, labels)
+        kept = slice(sure if sure >= config.expected else None)
+        message = _candidates(found.boxes[kept], found.confidences[kept], labels)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message
 
@@ -100,16 +102,16 @@ class RecordedDetections(Stage):
         for row, detection in zip(confidences, detections, strict=True):
             row[self._labels.index(detection.label)] = detection.score
         boxes = np.array([detection.box for detection in detections]).reshape(-1, 4)
-        return _candidates(Detections(boxes, confidences), self._labels)
+        return _candidates(boxes, confidences, self._labels)
 
 
-def _candidates(found: Detections, labels: tuple[str, ...]) -> Candidates:
+def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...]) -> Candidates:
     """Equation 1: each box with its most confident label."""
     candidates = tuple(
         Candidate(box=box, label=labels[int(row.argmax())], confidence=float(row.max()))
-        for box, row in zip(found.boxes, found.confidences, strict=True)
+        for box, row in zip(boxes, confidences, strict=True)
     )
-    return Candidates(candidates=candidates, labels=labels, confidences=found.confidences)
+    return Candidates(candidates=candidates, labels=labels, confidences=confidences)
 
 
 def _summary(message: Candidates) -> str:

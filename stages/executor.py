@@ -8,7 +8,6 @@ from pathlib import Path
 from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
-from stages.planning.transfer import Routine, TransferRoutine
 from stages.scene.catalogue import Catalogue
 
 
@@ -29,16 +28,20 @@ class Executor(Stage):
                 raise Refused(f"executor.attempts: {self.attempts} is too few; choose 1, 2, ...")
 
     def __init__(self, config: Config) -> None:
+        # Motion planning takes half a second to load; whoever only reads a graph does without.
+        from stages.planning.transfer import Routine, TransferRoutine
+
         self._config = config
         self._catalogue = Catalogue.load(Path(config.catalogue))
         self._robot = fetch.robot_model()
+        self._transfers = TransferRoutine
         self._routine: Routine | None = None
         self._ctx: Context | None = None
 
     def on_transfer_request(self, transfer_request: TransferRequest, ctx: Context) -> RobotCommand | Outcome:
         """Starts a transfer: the first command reads the encoders."""
         self._ctx = ctx
-        routine = TransferRoutine(
+        routine = self._transfers(
             transfer_request,
             robot=self._robot,
             table=tabletop.TABLE,

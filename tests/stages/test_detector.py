@@ -153,6 +153,11 @@ def test_recorded_categories_must_be_in_the_catalogue(tmp_path: Path) -> None:
         recorded(tmp_path, [entry(category_id=99)])
 
 
+def test_reading_a_graph_loads_neither_torch_nor_the_planners_of_motion() -> None:
+    program = "import sys, stages.detector, stages.executor; sys.exit(bool({'torch', 'toppra'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
 @pytest.mark.slow
 def test_the_network_finds_objects_in_images_it_never_saw() -> None:
     made = list(examples(Catalogue.load(CATALOGUE), layouts=30, views=2, seed=5000))
