@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.bus import Bus, Packet, Process
+from runner.bus import Bus
 from runner.children import last_lines, signal_group, spawn
 from runner.contract import Refused
 from runner.document import Document
@@ -36,6 +36,7 @@ from runner.hosts import (
     this_machine,
 )
 from runner.network import read_layout
+from runner.packet import Packet, Process
 from runner.provenance import revision
 from runner.terminal import Terminal
 
@@ -76,7 +77,8 @@ class Agent:
         # Until the session is there, Python cannot handle signals; they end this process by themselves.
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, signal.SIG_DFL)
-        bus = Bus(control(name), connect=self._layout.endpoint, network=self._network)
+        own = Process(self._host, 0, self._session)
+        bus = Bus(control(name), connect=self._layout.endpoint, network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
         try:
@@ -88,7 +90,7 @@ class Agent:
     def _take_part(self, bus: Bus) -> Dismiss:
         bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)
         bus.watch(self._on_presence)
-        bus.announce(Process(self._host, 0, self._session))
+        bus.announce()
         while not self._head_is_there:
             with contextlib.suppress(queue.Empty):
                 event = self._events.get(timeout=TICK_SECONDS)

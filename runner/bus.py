@@ -1,10 +1,11 @@
 """The transport: a Zenoh session on loopback, its keys, and who is present.
 
 =========================================  ====================================================================
-``RUN/m/STAGE/PORT``                       every message once (Envelope): for recorder and views
+``RUN/m/STAGE/PORT``                       every message once (Envelope), for the recorder
 ``RUN/d/STAGE/REPLICA/PORT``               the same bytes, delivered to one consumer's input port
 ``RUN/s/STAGE``                            a step that was done (Step), for the recorder
-``RUN/j/STAGE``                            journal: the recorder's echo of it; what it consumed is done with
+``RUN/j/STAGE``                            journal: the recorder's echo of steps; what they consumed is done with
+``RUN/a/STAGE/PORT``                       the recorder's echo of messages that the supervisor waits for
 ``RUN/gone/STAGE/REPLICA/INCARNATION``     the recorder's word that it has all that a dead process has sent
 ``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
 ``RUN/l/STAGE``                            log lines (LogLine)
@@ -13,6 +14,9 @@
 ``RUN/flush``                              query answered by the recorder once it has everything sent before
 ``RUN/q/NAME``                             question to the supervisor (status, down, restart, call), answered in JSON
 =========================================  ====================================================================
+
+What is for one process (``m``, ``d`` and ``s``) goes straight to it where it runs on the same machine, see
+:mod:`runner.links`, under the same key.
 
 Links keep their order, so that a step that the recorder has is there with everything it emitted. A process that is
 killed may have reached some peers and not others: what the recorder has is what counts, for everybody.
@@ -28,7 +32,6 @@ import hashlib
 import json
 import os
 import queue
-import re
 import socket
 import stat
 import struct
@@ -37,17 +40,18 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import zenoh
 from zenoh.handlers import Callback
 
+from runner.arena import Block, Store
 from runner.contract import Refused
+from runner.links import INLINE_BYTES, Door, Link, address_of
 from runner.network import Network
+from runner.packet import Packet, Process, badge
 from runner.security import security
 
 A = TypeVar("A")
@@ -63,62 +67,14 @@ GUEST_MS = 10_000
 """How long a guest calls a process that does not take the call."""
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
-RECORDER = "recorder"
+TEND_SECONDS = 0.05
+"""How often links are looked after while their process is busy elsewhere."""
 REFUSAL = zenoh.Encoding.TEXT_PLAIN
 """Of an error that was given as an answer; Zenoh's own, such as a time-out, have another."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Process:
-    """One process of the graph; each restart is another incarnation."""
-
-    stage: str
-    replica: int
-    incarnation: int = 0
-
-    @staticmethod
-    def of(key: str) -> Process:
-        """The process that a key ends with; raises Refused where it names none."""
-        match = re.search(r"(?:^|/)([^/]+)/([0-9]{1,9})/([0-9]{1,9})$", key)
-        if match is None:
-            raise Refused(f"names no process: {key[-60:]}; valid: STAGE/REPLICA/INCARNATION")
-        return Process(match[1], int(match[2]), int(match[3]))
-
-    @property
-    def path(self) -> str:
-        """The end of its keys."""
-        return f"{self.stage}/{self.replica}/{self.incarnation}"
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """What arrived on a key."""
-
-    key: str
-    payload: bytes
-    sent_ns: int
-    """Monotonic clock of this machine when it was sent; 0 where the sender did not say or has another clock."""
-    arrived_ns: int
-    genuine: bool = True
-    """Whether it comes from a process of this run, see :func:`_badge`."""
-
-    @property
-    def end(self) -> str:
-        """The last part of its key: the port that it is delivered to, or the stage that it comes from."""
-        return self.key.rpartition("/")[2]
-
-
 _SENT = struct.Struct("<qQ8s")
 """What accompanies a message: when it was sent, by which clock, and the sender's badge."""
-
-
-@lru_cache(4096)
-def _badge(secret: str, path: str) -> bytes:
-    """What the processes of one run, who share its secret, show with everything they publish on a key.
-
-    It keeps out what strays in, from another program or another run; who may come in at all is for TLS to say.
-    """
-    return hashlib.blake2b(path.encode(), key=secret.encode(), digest_size=8).digest()
 
 
 def _clock() -> int:
@@ -146,9 +102,12 @@ class Bus:
         connect: str | None = None,
         network: Network | None = None,
         secret: str = "",
+        process: Process | None = None,
         guest: bool = False,
     ):
         """``connect`` is called first; without a ``network`` all of it stays on loopback.
+
+        ``process`` is who this is; None for who only listens.
 
         What is published without the run's ``secret`` is refused by its processes. A ``guest`` speaks with the
         process it connects to and with nobody else: were it to stand still, no other would wait for it.
@@ -161,22 +120,108 @@ class Bus:
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._far = network is not None
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._process = process
+        self._host = network.host if network is not None else ""
+        self._present: dict[tuple[str, int], Process] = {}
+        """The newest process of each replica."""
+        self._links: dict[Process, Link | None] = {}
+        """To those on this machine; None for the others."""
+        self._retired: list[Link] = []
+        """Of processes that are gone, as far as they may still read."""
+        self._linking = threading.Lock()
+        self._store = Store()
+        self._door: Door | None = None
+        self._closed = threading.Event()
+        self._tender = threading.Thread(target=self._tend, name="links", daemon=True)
+        if process is not None:
+            self._tender.start()
         self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
         self._caller.start()
 
     def publish(self, path: str, payload: bytes) -> None:
-        """Sends without loss: a full link blocks. ``path`` is the key without the run."""
+        """Sends without loss: a full link blocks. ``path`` is the key without the run. Once closed it sends nothing."""
+        if self._closed.is_set():
+            return
         publisher = self._publishers.get(path) or self._declare(path, zenoh.CongestionControl.BLOCK)
         publisher.put(payload, attachment=self._attachment(path))
 
-    def offer(self, path: str, payload: bytes) -> None:
+    def load(self, parts: Sequence[bytes | memoryview]) -> bytes | Block:
+        """The parts of a message as one payload: in memory that consumers can read where it is large."""
+        small = sum(len(part) for part in parts) <= INLINE_BYTES
+        return b"".join(parts) if small else self._store.write(parts)
+
+    def deliver(self, to: tuple[str, int], path: str, payload: bytes | Block) -> bool:
+        """Sends to one process, (stage, replica), without loss, straight where it is on this machine.
+
+        True where it is in that process' hands, or the kernel's, and arrives even if this process dies now.
+        """
+        link = self._link_to(to)
+        if link is not None and link.send(path, payload):
+            return True
+        self.publish(path, bytes(payload.view) if isinstance(payload, Block) else payload)
+        return False
+
+    def _link_to(self, to: tuple[str, int]) -> Link | None:
+        process = self._present.get(to)
+        if process is None:
+            return None
+        with self._linking:
+            if process not in self._links:
+                self._links[process] = self._connect(process)
+            return self._links[process]
+
+    def _connect(self, process: Process) -> Link | None:
+        if self._process is None:
+            return None
+        address = address_of(self._run, self._secret, self._host, process)
+        try:
+            return Link(address, self._secret, self._process.path, self._store)
+        except OSError:
+            return None
+
+    def open_door(self, receive: Callable[[Packet], None], refuse: Callable[[str, Exception], None]) -> Door:
+        """Lets those on this machine deliver straight to this process, once it is announced.
+
+        ``receive`` gets what they send from whoever looks: see :class:`runner.links.Door`.
+        """
+        assert self._process is not None
+        address = address_of(self._run, self._secret, self._host, self._process)
+        self._door = Door(address, self._secret, receive, refuse)
+        return self._door
+
+    def _tend(self) -> None:
+        while not self._closed.wait(TEND_SECONDS):
+            if self._door is not None:
+                self._door.tend()
+            with self._linking:
+                links = [*filter(None, self._links.values()), *self._retired]
+            for link in links:
+                if not link.collect() and link in self._retired:
+                    self._retired.remove(link)
+                    link.close()
+
+    def _note(self, process: Process, present: bool) -> None:
+        """Keeps to the newest process of a replica; the link to an older one lasts as long as that may read."""
+        place = process.stage, process.replica
+        newest = self._present.get(place)
+        if present and (newest is None or process > newest):
+            self._present[place] = process
+        elif not present and process == newest:
+            del self._present[place]
+        else:
+            return
+        with self._linking:
+            link = self._links.pop(newest, None) if newest is not None else None
+        self._retired += [link] if link is not None else []
+
+    def offer(self, path: str, payload: bytes | memoryview) -> None:
         """Sends to whoever listens, and to nobody who would have to be waited for."""
         publisher = self._publishers.get(path) or self._declare(
             path, zenoh.CongestionControl.DROP, zenoh.Priority.DATA_LOW
         )
         if cast("Any", publisher).matching_status.matching:
-            publisher.put(payload, attachment=self._attachment(path))
+            publisher.put(bytes(payload), attachment=self._attachment(path))
 
     def _declare(
         self, path: str, congestion: zenoh.CongestionControl, priority: zenoh.Priority = zenoh.Priority.DATA
@@ -189,7 +234,7 @@ class Bus:
         return publisher
 
     def _attachment(self, path: str) -> bytes:
-        return _SENT.pack(time.monotonic_ns(), _CLOCK, _badge(self._secret, path))
+        return _SENT.pack(time.monotonic_ns(), _CLOCK, badge(self._secret, path))
 
     def subscribe(
         self, path: str, callback: Callable[[Packet], None], *, first: Callable[[Packet], None] | None = None
@@ -202,8 +247,8 @@ class Bus:
 
         def receive(sample: zenoh.Sample) -> None:
             arrived_ns = time.monotonic_ns()
-            key, (sent_ns, badge) = str(sample.key_expr)[skipped:], _attached(sample)
-            genuine = badge == _badge(self._secret, key)
+            key, (sent_ns, shown) = str(sample.key_expr)[skipped:], _attached(sample)
+            genuine = shown == badge(self._secret, key)
             packet = Packet(key, sample.payload.to_bytes(), sent_ns, arrived_ns, genuine)
             if first is not None:
                 first(packet)
@@ -212,9 +257,10 @@ class Bus:
         receiver = Callback(receive, indirect=False)
         self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", receiver))
 
-    def announce(self, process: Process) -> None:
+    def announce(self) -> None:
         """Declares this process present, until it closes or dies."""
-        self._declared.append(self._session.liveliness().declare_token(self._token(process)))
+        assert self._process is not None
+        self._declared.append(self._session.liveliness().declare_token(self._token(self._process)))
 
     def watch(
         self, callback: Callable[[Process, bool], None], refuse: Callable[[str, Exception], None] = lambda *_: None
@@ -235,6 +281,7 @@ class Bus:
             else:
                 if self._far and sample.kind == zenoh.SampleKind.PUT:
                     _close_dead_links_at_once()
+                self._note(process, sample.kind == zenoh.SampleKind.PUT)
                 callback(process, sample.kind == zenoh.SampleKind.PUT)
 
         subscriber = self._session.liveliness().declare_subscriber(
@@ -244,23 +291,29 @@ class Bus:
 
     def _token(self, process: Process) -> str:
         path = f"present/{process.path}"
-        return f"{self._run}/{path}/{_badge(self._secret, path).hex()}"
+        return f"{self._run}/{path}/{badge(self._secret, path).hex()}"
 
-    def answer_flush(self) -> None:
-        """Lets the others wait for the recorder: its answer follows everything they sent to it."""
+    def answer_flush(self, afterwards: Callable[[Callable[[], None]], None]) -> None:
+        """Lets the others wait for the recorder: its answer follows everything they sent to it.
+
+        ``afterwards`` is given each answer, to be called once what has come straight is taken and echoed too.
+        """
         key = f"{self._run}/flush"
 
-        def answer(query: zenoh.Query, _: int) -> None:
-            with query:
-                query.reply(key, _badge(self._secret, "flush"))
+        def answer(query: zenoh.Query) -> None:
+            with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
+                query.reply(key, badge(self._secret, "flush"))
 
-        self._declared.append(self._session.declare_queryable(key, self._in_turn(answer)))
+        def receive(query: zenoh.Query, _: int) -> None:
+            afterwards(lambda: answer(query))
+
+        self._declared.append(self._session.declare_queryable(key, self._in_turn(receive)))
 
     def flush(self) -> bool:
         """Waits until the recorder has received everything sent before; False where it does not answer in time."""
         replies = self._session.get(f"{self._run}/flush", timeout=FLUSH_SECONDS)
-        badge = _badge(self._secret, "flush")
-        return any(reply.ok is not None and reply.ok.payload.to_bytes() == badge for reply in replies)
+        shown = badge(self._secret, "flush")
+        return any(reply.ok is not None and reply.ok.payload.to_bytes() == shown for reply in replies)
 
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
@@ -270,19 +323,19 @@ class Bus:
         """
         key = f"{self._run}/q/{name}"
 
-        badge = _badge(self._secret, f"q/{name}")
+        shown = badge(self._secret, f"q/{name}")
 
         def receive(query: zenoh.Query) -> None:
-            threading.Thread(target=_reply, args=(query, key, badge, answer), name=name, daemon=True).start()
+            threading.Thread(target=_reply, args=(query, key, shown, answer), name=name, daemon=True).start()
 
         self._declared.append(self._session.declare_queryable(key, Callback(receive, indirect=False)))
 
     def ask(self, name: str, question: bytes, timeout_s: float) -> bytes:
         """The answer of whoever serves ``name``; raises Refused with its reason, or where nobody answers in time."""
-        deadline, badge = time.monotonic() + timeout_s, _badge(self._secret, f"q/{name}")
+        deadline, shown = time.monotonic() + timeout_s, badge(self._secret, f"q/{name}")
         while (left := deadline - time.monotonic()) > 0:
             key = f"{self._run}/q/{name}"
-            for reply in self._session.get(key, payload=question, attachment=badge, timeout=left):
+            for reply in self._session.get(key, payload=question, attachment=shown, timeout=left):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and reply.err.encoding == REFUSAL:
@@ -294,11 +347,19 @@ class Bus:
         """Withdraws everything declared and closes the session."""
         for declared in reversed(self._declared):
             declared.undeclare()
+        self._closed.set()
         self._calls.put(None)
         if threading.current_thread() is not self._caller:
             self._caller.join(FLUSH_SECONDS)
         with contextlib.suppress(zenoh.ZError):  # who is cut off cannot say goodbye
             self._session.close()
+
+        if self._process is not None:
+            self._tender.join()
+        if self._door is not None:
+            self._door.close()
+        for link in (*filter(None, self._links.values()), *self._retired):
+            link.close()
 
     def _in_turn(self, receive: Callable[[A, int], None]) -> Callback[A]:
         """A handler that only queues, so that it may run on the link's own thread; it gets the time of arrival."""
@@ -360,10 +421,10 @@ def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
         return f"{like.rpartition(':')[0]}:{probe.getsockname()[1]}"
 
 
-def _reply(query: zenoh.Query, key: str, badge: bytes, answer: Callable[[bytes], bytes]) -> None:
+def _reply(query: zenoh.Query, key: str, shown: bytes, answer: Callable[[bytes], bytes]) -> None:
     with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
         try:
-            if query.attachment is None or query.attachment.to_bytes() != badge:
+            if query.attachment is None or query.attachment.to_bytes() != shown:
                 raise Refused("only who knows the secret of this run may ask")
             query.reply(key, answer(query.payload.to_bytes() if query.payload else b""))
         except Refused as refusal:

@@ -30,6 +30,8 @@ DTYPES = {
     )
 }
 """Element types an array may have, little-endian on the wire."""
+_NAMES = {dtype: name for name, dtype in DTYPES.items()}
+_BOOL = DTYPES["bool"]
 
 
 class CodecError(Exception):
@@ -88,6 +90,12 @@ class Step(msgspec.Struct, frozen=True):
     """Time inside the handler."""
     outcome: Outcome = "done"
     error: str = ""
+
+
+class Journal(msgspec.Struct, frozen=True):
+    """Steps of one stage that the recorder has, in its order."""
+
+    steps: tuple[Step, ...]
 
 
 class Receipt(msgspec.Struct, frozen=True):
@@ -150,23 +158,20 @@ def _to_wire(value: Any) -> Any:
         return value.item()
     if not isinstance(value, np.ndarray):
         raise ValueError(f"{type(value).__name__} cannot be encoded")
-    if value.dtype not in DTYPES.values():
+    name = _NAMES.get(value.dtype)
+    if name is None:
         raise ValueError(f"an array of {value.dtype} cannot be encoded; valid: {', '.join(DTYPES)}")
-    return [value.dtype.name, value.shape, _elements(value)]
-
-
-def _elements(array: np.ndarray) -> memoryview | bytes:
-    """The bytes of an array in C order, not copied where they lie so."""
-    return array.reshape(-1).view(np.uint8).data if array.flags.c_contiguous else array.tobytes()
+    # In C order, and not copied where the elements lie so.
+    return [name, value.shape, value.data if value.flags.c_contiguous else value.tobytes()]
 
 
 def _from_wire(kind: type, value: Any) -> Any:
     """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
+    if isinstance(value, np.ndarray):  # of a message that is checked before it travels
+        return cast("Any", value)
     if get_origin(kind) is not np.ndarray:
         raise ValueError(f"{kind} cannot be decoded")
     match value:
-        case np.ndarray():  # of a message that is checked before it travels
-            return cast("Any", value)
         case [str() as name, list() as shape, bytes() as data]:
             return _array(name, cast("list[Any]", shape), data)
         case _:
@@ -177,18 +182,18 @@ def _array(name: str, shape: list[Any], data: bytes) -> np.ndarray:
     dtype = DTYPES.get(name)
     if dtype is None:
         raise ValueError(f"element type {name[:20]!r} is not one of {', '.join(DTYPES)}")
-    if len(shape) > MAX_DIMENSIONS or any(type(extent) is not int or extent < 0 for extent in shape):
+    if len(shape) > MAX_DIMENSIONS or [one for one in shape if type(one) is not int or one < 0]:
         raise ValueError(f"shape {str(shape)[:60]} is not a list of at most {MAX_DIMENSIONS} extents")
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {name}")
-    if dtype == np.bool_ and data.strip(b"\x00\x01"):
+    if dtype is _BOOL and data.strip(b"\x00\x01"):
         raise ValueError("a bool is neither 0 nor 1")
     return np.ndarray(shape, dtype, buffer=data)
 
 
 def _check_array(array: np.ndarray, spec: Spec, place: str) -> None:
     """Raises ValueError unless the array is what its field declares."""
-    if array.dtype.name != spec.dtype:
+    if array.dtype != DTYPES[spec.dtype]:
         raise ValueError(f"expected {spec.dtype}, got {array.dtype.name} - at `{place}`")
     if not _fits(array.shape, spec.shape):
         raise ValueError(f"expected shape {_shape(spec.shape)}, got {_shape(array.shape)} - at `{place}`")
@@ -312,13 +317,18 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     return message
 
 
-def pack(record: Envelope | Step | Receipt | LogLine | Pulse) -> bytes:
+def pack(record: Envelope | Step | Journal | Receipt | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike."""
     return _encoder().encode(record)
 
 
-def unpack(kind: type[R], payload: bytes) -> R:
-    """Reads an Envelope, Step, Receipt, LogLine or Pulse; raises CodecError and nothing else, whatever the bytes."""
+def parts(sealed: Envelope) -> tuple[bytes, memoryview]:
+    """What :func:`pack` makes of an envelope, in two parts: a large body is not copied."""
+    return pack(msgspec.structs.replace(sealed, body=msgspec.Raw())), memoryview(sealed.body)
+
+
+def unpack(kind: type[R], payload: bytes | memoryview) -> R:
+    """Reads a record; raises CodecError and nothing else, whatever the bytes."""
     return _decode(kind, payload)
 
 
@@ -362,7 +372,7 @@ def _named(value: Any) -> Any:
             return value
 
 
-def _decode(kind: type[R], payload: bytes | msgspec.Raw) -> R:
+def _decode(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
     size = memoryview(payload).nbytes
     if size > MAX_BYTES:
         raise CodecError(kind.__name__, "", f"{size} bytes are more than the limit of {MAX_BYTES}")

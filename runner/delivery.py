@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from runner.bus import Process
+from runner.arena import Block
 from runner.codec import Envelope
 from runner.graph import Route
+from runner.packet import Process
 
 PREFETCH = 2
 """Parts a replica holds at a time: the one it works on and the next, so that it never waits for a delivery."""
@@ -16,8 +17,9 @@ POLL_SECONDS = 0.1
 PATIENCE_SECONDS = 30.0
 """A publisher that is held back for longer says so."""
 
-Send = Callable[[str, bytes], None]
-"""Publishes on a path of the bus."""
+Payload = bytes | Block
+Send = Callable[[tuple[str, int], str, Payload], bool]
+"""Delivers to a process, (stage, replica), under a key; returns whether it arrives whatever happens to this process."""
 Warn = Callable[[str], None]
 
 
@@ -31,7 +33,7 @@ class _Entry:
 
     id: str
     lineage: str
-    payload: bytes
+    payload: Payload
     replica: int | None = None
     """Who has been given this part."""
     received: bool = False
@@ -39,27 +41,28 @@ class _Entry:
 
 
 class Courier:
-    """Sends the newest of a path from a thread of its own: a consumer that stands still holds nobody up."""
+    """Sends the newest of a key from a thread of its own: a consumer that stands still holds nobody up."""
 
     def __init__(self, send: Send):
         self._send = send
-        self._waiting: dict[str, bytes] = {}
+        self._waiting: dict[str, tuple[tuple[str, int], Payload]] = {}
         self._changed = threading.Condition()
         threading.Thread(target=self._send_all, name="courier", daemon=True).start()
 
-    def take(self, path: str, payload: bytes) -> None:
-        """Sends soon; what waits on the same path is left out."""
+    def take(self, to: tuple[str, int], key: str, payload: Payload) -> bool:
+        """Sends soon; what waits under the same key is left out."""
         with self._changed:
-            self._waiting[path] = payload
+            self._waiting[key] = to, payload
             self._changed.notify()
+        return False
 
     def _send_all(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting)
-                path = next(iter(self._waiting))
-                payload = self._waiting.pop(path)
-            self._send(path, payload)
+                key = next(iter(self._waiting))
+                to, payload = self._waiting.pop(key)
+            self._send(to, key, payload)
 
 
 class Outgoing:
@@ -75,7 +78,7 @@ class Outgoing:
 
     def has_room(self, lineage: str) -> bool:
         """Whether one more message may be accepted: a queue is counted in lineages, so that no join can starve."""
-        if self.route.policy == "latest":
+        if self.route.policy == "latest" or len(self._pending) < self.route.queue:
             return True
         lineages = {entry.lineage for entry in self._pending.values()}
         return lineage in lineages or len(lineages) < self.route.queue
@@ -156,7 +159,9 @@ class Outgoing:
                 self._deliver(entry, entry.replica)
 
     def _deliver(self, entry: _Entry, replica: int) -> None:
-        self._send(f"d/{self.route.consumer}/{replica}/{self.route.input}", entry.payload)
+        consumer = self.route.consumer
+        if self._send((consumer, replica), f"d/{consumer}/{replica}/{self.route.input}", entry.payload):
+            entry.received = True
 
 
 class Delivery:
@@ -173,7 +178,7 @@ class Delivery:
         self._newest: dict[tuple[str, int], Process] = {}
         """The newest process seen of each replica."""
 
-    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
+    def publish(self, port: str, envelope: Envelope, payload: Payload) -> None:
         """Hands a message to every consumer of a port; blocks while one's queue is full. Raises Stopped."""
         for edge in self._edges:
             if edge.route.output == port:

@@ -18,7 +18,7 @@ SHOWN_ITEMS = 32
 SHOWN_CHARACTERS = 2000
 
 
-def lines_of(payload: bytes) -> Iterator[str]:
+def lines_of(payload: bytes | memoryview) -> Iterator[str]:
     """The envelope in one line and its content below; what cannot be read is said, never raised."""
     try:
         envelope = unpack(Envelope, payload)

@@ -8,12 +8,12 @@ from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from runner.bus import Process
 from runner.children import ending, last_lines, signal_group
 from runner.codec import Pulse, Step
 from runner.graph import Limits
 from runner.health import Watch, gigabytes, oom_kills
 from runner.hosts import RemoteChild
+from runner.packet import Process
 from runner.step import sequence_of
 
 

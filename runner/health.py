@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from runner import codec
-from runner.bus import Bus, Process
+from runner.bus import Bus
 from runner.codec import Pulse
 from runner.graph import Limits
+from runner.packet import Process
 
 PULSE_SECONDS = 0.5
 SLOW_SECONDS = 5.0

@@ -4,7 +4,6 @@ import contextlib
 import gc
 import itertools
 import os
-import queue
 import signal
 import sys
 import threading
@@ -18,15 +17,16 @@ from typing import Any
 import msgspec
 
 from runner import codec
-from runner.bus import RECORDER, Bus, Packet, Presence, Process
+from runner.bus import Bus, Presence
 from runner.children import die_with_parent, explain_death, volunteer_for_oom
-from runner.codec import CodecError, Envelope, LogLine, Outcome, Receipt, Step
+from runner.codec import CodecError, Envelope, Journal, LogLine, Outcome, Receipt, Step
 from runner.contract import Level, Refused
 from runner.delivery import Delivery, Stopped
 from runner.graph import Route, node_from_entry
 from runner.health import Heart
 from runner.inbox import Inbox, Mailbox, Mismatched, Ready
 from runner.network import Network
+from runner.packet import RECORDER, Packet, Process
 from runner.past import past_of, relive
 from runner.ports import Handler
 from runner.recording import Recording
@@ -66,6 +66,8 @@ class Assignment(msgspec.Struct, frozen=True):
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
     """True where an earlier process has run the start handlers."""
+    recorded: frozenset[str] = frozenset()
+    """Output ports that the recorder is sent."""
     consumed: tuple[tuple[str, str], ...] = ()
     """(port, id) of the newest that earlier processes have consumed: it may be sent again, and is not worked on."""
 
@@ -82,14 +84,18 @@ class Host:
             recording = Recording(Path(assignment.past))
             steps = past_of(recording, assignment.stage, assignment.incarnation)
             relive(self._node, self._stage, assignment.seed, recording, steps)
-        self._bus = Bus(
-            assignment.run, connect=assignment.endpoint, network=assignment.network, secret=assignment.secret
-        )
         self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
+        self._bus = Bus(
+            assignment.run,
+            connect=assignment.endpoint,
+            network=assignment.network,
+            secret=assignment.secret,
+            process=self._process,
+        )
         self._presence = Presence()
         self._stopping = threading.Event()
         self._retiring = threading.Event()
-        self._delivery = Delivery(assignment.routes, self._bus.publish, self._warn, self._stopping.is_set)
+        self._delivery = Delivery(assignment.routes, self._bus.deliver, self._warn, self._stopping.is_set)
         self._inbox = Inbox(self._node)
         self._executor = Executor(
             self._node,
@@ -99,12 +105,13 @@ class Host:
             log=self._log,
             numbers=assignment.numbers,
         )
-        self._mailbox = Mailbox(self._node)
         self._receipts: deque[Receipt] = deque()
         self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
         """(port, id) of what has arrived, and whether it is consumed."""
         self._remember(one for one in assignment.consumed if not self._node.keeps(one[0]))
         self._refusals = Refusals(lambda text: self._log(text, "error"))
+        self._mailbox = Mailbox(self._node)
+        self._door = self._bus.open_door(self._mailbox.put, self._refusals.refuse)
         self._steps = 0
         self._present: _Record | None = None
         """The step that runs."""
@@ -123,14 +130,14 @@ class Host:
     def stop(self) -> None:
         """Ends :meth:`run` after the present step. May be called from a signal handler."""
         self._stopping.set()
-        self._mailbox.wake()
+        self._door.knock()
 
     def retire(self) -> None:
         """Ends :meth:`run` after the whole present step; a successor does the rest. May be called from a signal
         handler.
         """
         self._retiring.set()
-        self._mailbox.wake()
+        self._door.knock()
 
     def close(self) -> None:
         """Lets the recorder catch up, then releases the stage and the bus."""
@@ -149,14 +156,14 @@ class Host:
     def _connect(self) -> None:
         """Subscribes to everything first and announces this process last: who sees it may send."""
         for consumer in {route.consumer for route in self._task.routes}:
-            self._bus.subscribe(f"j/{consumer}", self._on_step)
+            self._bus.subscribe(f"j/{consumer}", self._on_journal)
             self._bus.subscribe(f"r/{consumer}", self._on_receipt)
         self._bus.subscribe(
             f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery, first=self._hand_over
         )
         self._bus.watch(self._on_presence)
         self._heart.start()
-        self._bus.announce(self._process)
+        self._bus.announce()
 
     def _vitals(self) -> dict[str, Any]:
         """What the pulse says beyond what holds for any process. Runs on the pulse's thread and waits for nobody."""
@@ -182,11 +189,12 @@ class Host:
         self._presence.update(process, present)
         self._delivery.update(process, present)
 
-    def _on_step(self, packet: Packet) -> None:
+    def _on_journal(self, packet: Packet) -> None:
         """A step that was done acknowledges what it consumed; one that failed will be tried again."""
-        step = self._refusals.read(Step, packet)
-        if step is not None and step.outcome == "done":
-            self._delivery.acknowledge(step.stage, step.consumed)
+        journal = self._refusals.read(Journal, packet)
+        for step in journal.steps if journal is not None else ():
+            if step.outcome == "done":
+                self._delivery.acknowledge(step.stage, step.consumed)
 
     def _on_receipt(self, packet: Packet) -> None:
         receipt, consumer = self._refusals.read(Receipt, packet), packet.end
@@ -202,11 +210,15 @@ class Host:
             id = admit(Envelope, packet).id
             self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
         self._mailbox.put(packet)
+        self._door.knock()
 
     def _on_delivery(self, _: Packet) -> None:
         """Gives receipts at once, however long the present step takes."""
         while self._receipts:
-            self._bus.publish(f"r/{self._process.stage}", codec.pack(self._receipts.popleft()))
+            self._give_receipt(self._receipts.popleft())
+
+    def _give_receipt(self, receipt: Receipt) -> None:
+        self._bus.publish(f"r/{self._process.stage}", codec.pack(receipt))
 
     def _take(self, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
@@ -214,6 +226,8 @@ class Host:
         try:
             envelope = codec.unpack(Envelope, packet.payload)
             if packet.genuine and (name, envelope.id) in self._arrived:
+                if packet.near and self._arrived[name, envelope.id]:
+                    self._give_receipt(Receipt(name, envelope.id, consumed=True))
                 return
             port = self._node.type.inputs.get(name)
             if port is None:
@@ -246,11 +260,9 @@ class Host:
 
     def _take_all(self, *, wait: bool) -> None:
         """Takes every packet that is there; waits for one if there is nothing else to do."""
-        with contextlib.suppress(queue.Empty):
-            packet = self._mailbox.fetch(wait=wait and not self._inbox.has_ready)
-            while packet is not None:
-                self._take(packet)
-                packet = self._mailbox.fetch(wait=False)
+        self._door.look(wait=wait and self._mailbox.empty and not self._inbox.has_ready)
+        for packet in self._mailbox.take():
+            self._take(packet)
 
     def _step(self, ready: Ready) -> None:
         """Runs one handler to its end and journals it."""
@@ -298,14 +310,15 @@ class Host:
 
     def _emit(self, envelope: Envelope) -> None:
         """Sends a message: to those who wait for it, then to the recorder, also where the graph ends meanwhile."""
-        payload = codec.pack(envelope)
+        payload = self._bus.load(codec.parts(envelope))
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
         try:
             self._delivery.publish(port, envelope, payload)
         finally:
-            self._bus.publish(f"m/{self._process.stage}/{port}", payload)
+            if port in self._task.recorded:
+                self._bus.deliver((RECORDER, 0), f"m/{self._process.stage}/{port}", payload)
 
     def _journal(self, record: "_Record") -> None:
         step = record.step(self._process, self._steps)
@@ -313,7 +326,12 @@ class Host:
         if step.outcome == "done":
             self._remember(step.consumed)
         payload = codec.pack(step)
-        self._delivery.after_arrival(step.emitted, lambda: self._bus.publish(f"s/{self._process.stage}", payload))
+        key = f"s/{self._process.stage}"
+
+        def journal() -> None:
+            self._bus.deliver((RECORDER, 0), key, payload)
+
+        self._delivery.after_arrival(step.emitted, journal)
 
     def _say_what_is_left(self) -> None:
         """Records what was never worked on."""

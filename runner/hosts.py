@@ -24,12 +24,13 @@ from typing import Any, cast
 
 import msgspec
 
-from runner.bus import Bus, Packet, Process, Router, free_endpoint
+from runner.bus import Bus, Router, free_endpoint
 from runner.contract import Level, Refused
 from runner.document import Document, read_document, suggest
 from runner.host import Assignment
 from runner.keys import credentials
 from runner.network import Layout, Network
+from runner.packet import Packet, Process
 from runner.provenance import fingerprint, machine, package_versions, revision
 
 ABSENT_SECONDS = 60.0
@@ -187,7 +188,13 @@ class Hosts:
         self._remind_at = time.monotonic()
         self._router = Router(self.endpoint, network) if layout.router_is_head else None
         listen = None if network.routed else self.endpoint
-        self._bus = Bus(control(name), listen=listen, connect=None if listen else self.endpoint, network=network)
+        self._bus = Bus(
+            control(name),
+            listen=listen,
+            connect=None if listen else self.endpoint,
+            network=network,
+            process=Process(network.head, 0, secrets.randbits(24)),
+        )
 
     def listen(self) -> str | None:
         """An endpoint for the head's own session of the run; None where it meets the others at a router."""
@@ -200,7 +207,7 @@ class Hosts:
         self._bus.subscribe("report/*/*", self._on_report)
         self._bus.watch(self._on_presence)
         self._bus.serve("join", lambda text: msgspec.json.encode(self._join(msgspec.json.decode(text, type=Hello))))
-        self._bus.announce(Process(self.network.head, 0, secrets.randbits(24)))
+        self._bus.announce()
 
     def start(self, host: str, process: Process, task: Assignment, log: Path) -> RemoteChild:
         """Has a process started, as soon as its host is there."""

@@ -1,15 +1,14 @@
 """Puts messages together to steps: joins and gathers by lineage, whatever the order of arrival."""
 
-import queue
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import cast
 
-from runner.bus import Packet
 from runner.contract import Part
 from runner.graph import Node
+from runner.packet import Packet
 from runner.ports import Handler, InputPort
 from runner.step import Arrival
 
@@ -19,7 +18,7 @@ class Mailbox:
 
     def __init__(self, node: Node):
         self._latest = {port for port, edge in node.inputs.items() if edge.policy == "latest"}
-        self._queue: queue.SimpleQueue[Packet | str | None] = queue.SimpleQueue()
+        self._queue: deque[Packet | str] = deque()
         self._newest: dict[str, Packet] = {}
         self._exchanging = threading.Lock()
         self._come = dict.fromkeys(node.inputs, 0)
@@ -29,30 +28,34 @@ class Mailbox:
         """Messages that a newer one replaced before they were decoded."""
 
     def put(self, packet: Packet) -> None:
-        """Takes a packet from the link's thread."""
+        """Takes a packet, from any thread."""
         port = packet.end
         if port not in self._latest or not packet.genuine:
             if port in self._come:
                 self._come[port] += 1
-            self._queue.put(packet)
+            self._queue.append(packet)
             return
         with self._exchanging:
             self.replaced[port] += port in self._newest
             if port not in self._newest:
-                self._queue.put(port)
+                self._queue.append(port)
             self._newest[port] = packet
 
-    def wake(self) -> None:
-        """Makes who waits look up. May be called from a signal handler."""
-        self._queue.put(None)
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to take."""
+        return not self._queue
 
-    def fetch(self, *, wait: bool) -> Packet | None:
-        """The next packet; None when woken. Raises queue.Empty where there is none and it need not wait."""
-        item = self._queue.get(block=wait)
+    def take(self) -> Iterator[Packet]:
+        """Every packet that is there."""
+        while self._queue:
+            yield self._fetch(self._queue.popleft())
+
+    def _fetch(self, item: Packet | str) -> Packet:
         if isinstance(item, str):
             with self._exchanging:
                 return self._newest.pop(item)
-        if item is not None and (port := item.end) in self._fetched:
+        if (port := item.end) in self._fetched:
             self._fetched[port] += 1
         return item
 
@@ -99,6 +102,10 @@ class Inbox:
         handler = self._node.type.handler_of(arrival.port.name)
         if self._node.inputs[arrival.port.name].policy == "latest":
             self._discard_older(handler, arrival.port)
+        if len(handler.inputs) == 1 and arrival.port.kind == "one":
+            self._count(handler, arrival.port, 1)
+            self._ready.append(Ready(handler, (arrival,)))
+            return
         lineage = self._lineages[handler.name].setdefault(arrival.envelope.lineage, _Lineage())
         waiting = lineage.waiting.setdefault(arrival.port.name, deque())
         if arrival.port.kind == "gather":

@@ -11,10 +11,11 @@ from typing import TypeVar
 import msgspec
 import zenoh
 
-from runner.bus import Bus, Packet
+from runner.bus import Bus
 from runner.calls import CallQuestion, CallRequest, CommandType, Progress
 from runner.contract import Refused
 from runner.document import suggest
+from runner.packet import Packet
 from runner.registry import Entry, is_alive
 from runner.status import RunStatus
 from runner.tap import Header, Listener

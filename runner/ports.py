@@ -4,6 +4,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, is_dataclass
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from runner.contract import Command, Context, Message, Part, Refused, Stage
@@ -18,7 +19,7 @@ class InputPort:
     kind: Literal["one", "gather"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Handler:
     """A method the runner calls: a join of its inputs, or a start without any."""
 
@@ -27,23 +28,29 @@ class Handler:
     context: str | None
     """Name of the parameter that receives the step's context."""
 
-    @property
+    @cached_property
     def is_command(self) -> bool:
         """True for what is called from outside the graph."""
         return any(issubclass(port.type, Command) for port in self.inputs)
 
-    @property
+    @cached_property
     def driver(self) -> InputPort | None:
         """The input whose message seeds the step's random numbers: the part of a join if any, else the first."""
         return next((port for port in self.inputs if issubclass(port.type, Part)), next(iter(self.inputs), None))
 
     def keeps(self, port: InputPort) -> bool:
         """True for what a join with a part uses again for every part of its lineage."""
+        return port.name in self._kept
+
+    @cached_property
+    def _kept(self) -> frozenset[str]:
         driver = self.driver
-        return driver is not None and driver.kind == "one" and issubclass(driver.type, Part) and port != driver
+        if driver is None or driver.kind != "one" or not issubclass(driver.type, Part):
+            return frozenset()
+        return frozenset(port.name for port in self.inputs if port != driver)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StageType:
     """What the annotations of a stage class say."""
 
@@ -55,19 +62,23 @@ class StageType:
     outputs: dict[str, type[Message]]
     config: type[Any] | None
 
-    @property
+    @cached_property
     def inputs(self) -> dict[str, InputPort]:
         """All input ports by name."""
         return {port.name: port for handler in self.handlers for port in handler.inputs}
 
-    @property
+    @cached_property
     def commands(self) -> dict[str, type[Command]]:
         """The input ports that ``runner call`` reaches, by name."""
         return {port.name: port.type for port in self.inputs.values() if issubclass(port.type, Command)}
 
     def handler_of(self, port: str) -> Handler:
         """The handler that takes what arrives on a port."""
-        return next(handler for handler in self.handlers if any(p.name == port for p in handler.inputs))
+        return self._handlers[port]
+
+    @cached_property
+    def _handlers(self) -> dict[str, Handler]:
+        return {port.name: handler for handler in self.handlers for port in handler.inputs}
 
 
 def inspect_stage(cls: type[Stage]) -> StageType:
@@ -84,6 +95,7 @@ def inspect_stage(cls: type[Stage]) -> StageType:
     return StageType(cls, handlers, source, outputs, _config_type(cls))
 
 
+@cache
 def port_name(kind: type[Message]) -> str:
     """Snake case of a message type: ``SceneEstimate`` -> ``scene_estimate``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", kind.__name__).lower()

@@ -9,21 +9,23 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from runner.bus import RECORDER, Bus, Packet, Process
+from runner.bus import Bus
 from runner.children import die_with_parent, explain_death, is_orphan
-from runner.codec import CodecError, Envelope, LogLine, Step, json_schema, pack, unpack
+from runner.codec import CodecError, Envelope, Journal, LogLine, Step, json_schema, pack, unpack
 from runner.container import hold
 from runner.contract import Message, Refused
 from runner.health import Heart
 from runner.network import Network
+from runner.packet import RECORDER, Packet, Process
 from runner.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording import (
     JOURNAL,
@@ -52,6 +54,8 @@ LAST_RESORT_SECONDS = 30
 """After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
 EXIT_REFUSED = 2
+REST_SECONDS = 0.004
+"""What may come together before the recorder looks again."""
 BACKLOG_BYTES = 2**30
 """What may wait for the disk; beyond it payloads are dropped, counted, and the recording is INCOMPLETE."""
 
@@ -86,6 +90,8 @@ class Manifest(msgspec.Struct, frozen=True):
     """Of the run's bus."""
     steps_only: bool = False
     """Record no messages."""
+    awaited: tuple[str, ...] = ()
+    """Topics that the supervisor waits for: they are passed on to it."""
 
 
 def topic(kind: type[Message]) -> Topic:
@@ -115,7 +121,7 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
 @dataclass(frozen=True, slots=True)
 class _Payload:
     kind: Kind
-    data: bytes
+    data: bytes | memoryview
     received_ns: int
 
 
@@ -151,7 +157,7 @@ class RecordingWriter:
         self._thread = threading.Thread(target=self._write_all, name="recording", daemon=True)
         self._thread.start()
 
-    def put(self, kind: Kind, data: bytes) -> None:
+    def put(self, kind: Kind, data: bytes | memoryview) -> None:
         """Takes one payload as it came over the bus."""
         with self._counting:
             if self._waiting_bytes > BACKLOG_BYTES:
@@ -210,7 +216,7 @@ class RecordingWriter:
                     payload()
         self._refuse(f"recording ends here: {error.strerror}")
 
-    def _lose(self, kind: Kind, data: bytes) -> None:
+    def _lose(self, kind: Kind, data: bytes | memoryview) -> None:
         """Counts a payload that is not recorded, and names what it is or speaks of."""
         self._dropped += 1
         with contextlib.suppress(CodecError):
@@ -274,7 +280,8 @@ class RecordingWriter:
     def _add(self, topic: str, kind: str, payload: _Payload, time_ns: int, sequence: int) -> None:
         self._recorded += 1
         channel = self._channels.get(topic) or self._register(topic, kind)
-        self._writer.add_message(channel, payload.received_ns, payload.data, time_ns, sequence % 2**32)
+        data = cast("bytes", payload.data)  # which need not be in one
+        self._writer.add_message(channel, payload.received_ns, data, time_ns, sequence % 2**32)
 
     def _register(self, topic: str, kind: str) -> int:
         known = self._topics.get(topic)
@@ -311,6 +318,8 @@ def _create(path: Path) -> IO[bytes]:
     return file
 
 
+_Echo = Step | Callable[[], None] | None
+"""A step, what else is to be done in its turn, or the end."""
 _SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, LogLine)}
 
 
@@ -320,35 +329,47 @@ class Recorder:
     def __init__(self, manifest: Manifest) -> None:
         """Creates the recording; raises Refused where that fails."""
         self._ends: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        self._steps_only = manifest.steps_only
-        self._bus = Bus(manifest.run, secret=manifest.secret, connect=manifest.endpoint, network=manifest.network)
+        self._manifest = manifest
+        self._bus = Bus(
+            manifest.run,
+            connect=manifest.endpoint,
+            network=manifest.network,
+            secret=manifest.secret,
+            process=Process(RECORDER, 0),
+        )
         self._writer = RecordingWriter(manifest, self._complain)
         self._tap = Tap(self._bus)
-        self._echoes: queue.SimpleQueue[tuple[str, bytes] | None] = queue.SimpleQueue()
+        self._echoes: queue.SimpleQueue[_Echo] = queue.SimpleQueue()
         self._gone: set[Process] = set()
-        self._echo = threading.Thread(target=self._echo_all, name="echo", daemon=True)
+        self._echoer = threading.Thread(target=self._echo_all, name="echo", daemon=True)
         self._refusals = Refusals(self._complain)
+        self._door = self._bus.open_door(self._on_delivery, self._refusals.refuse)
+        self._reader = threading.Thread(target=self._read_all, name="door", daemon=True)
+        self._ended = threading.Event()
         self._present: set[Process] = set()
         """Processes of stages."""
         self._heart = Heart(Process(RECORDER, 0), self._bus, self._vitals)
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
-        self._echo.start()
-        if not self._steps_only:
-            self._bus.subscribe("m/**", self._on_message)
+        self._echoer.start()
+        self._reader.start()
+        self._bus.subscribe("m/**", self._on_message)
         self._bus.subscribe("s/*", self._on_step)
         self._bus.subscribe("l/*", self._on_log)
         self._bus.watch(self._on_presence, self._refusals.refuse)
-        self._bus.answer_flush()
-        self._bus.announce(Process(RECORDER, 0))
+        self._bus.answer_flush(self._when_all_is_said)
+        self._bus.announce()
         self._heart.start()
         orphaned = self._wait_for_the_end()
         if orphaned:
             self._outlive()
         self._heart.stop()
+        self._ended.set()
+        self._door.knock()
+        self._reader.join()
         self._echoes.put(None)
-        self._echo.join(FLUSH_SECONDS)
+        self._echoer.join(FLUSH_SECONDS)
         self._bus.close()
         return self._writer.close()
 
@@ -364,9 +385,22 @@ class Recorder:
                 return self._ends.get(timeout=FLUSH_SECONDS)
         return True
 
+    def _read_all(self) -> None:
+        """Takes what processes of this machine send. Between two looks it waits for more: being woken costs most."""
+        while not self._ended.is_set():
+            self._door.look(wait=True)
+            time.sleep(REST_SECONDS)
+        self._door.look(wait=False)
+
+    def _on_delivery(self, packet: Packet) -> None:
+        (self._on_step if packet.key.startswith("s/") else self._on_message)(packet)
+
     def _on_message(self, packet: Packet) -> None:
-        if self._take(Envelope, packet):
+        topic = packet.key.partition("/")[2]
+        if not self._manifest.steps_only and self._take(Envelope, packet):
             self._tap.pass_on(packet)
+        if packet.genuine and topic in self._manifest.awaited:
+            self._echo(f"a/{topic}", bytes(packet.payload))
 
     def _outlive(self) -> None:
         """The stages die with the supervisor; what they have said until then is recorded."""
@@ -393,28 +427,58 @@ class Recorder:
 
     def _on_step(self, packet: Packet) -> None:
         """Refuses what a process says that was cut off: the others know it as gone, and do its work again."""
-        with contextlib.suppress(CodecError):  # what is malformed is refused by the writer
+        try:
             step = unpack(Step, packet.payload)
-            if Process(step.stage, step.replica, step.incarnation) in self._gone:
-                return
-        if self._take(Step, packet):
-            self._echoes.put((f"j/{packet.key.partition('/')[2]}", packet.payload))
+        except CodecError:
+            self._take(Step, packet)  # and the writer says what is wrong with it
+            return
+        if step.stage != packet.end:
+            wrong = CodecError("Step", "stage", f"expected {packet.end}, got {step.stage[:60]!r}")
+            self._refusals.refuse(packet.key, wrong)
+        elif Process(step.stage, step.replica, step.incarnation) not in self._gone and self._take(Step, packet):
+            self._echoes.put(step)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if process.stage != RECORDER:
             (self._present.add if present else self._present.discard)(process)
         if not present:
-            self._gone.add(process)
-            self._writer.after_flush(lambda: self._echoes.put((f"gone/{process.path}", b"")))
+            self._door.after_all(lambda: self._bury(process))
+
+    def _bury(self, process: Process) -> None:
+        """What a process has sent straight to here before it died has been taken by now."""
+        self._gone.add(process)
+        self._writer.after_flush(lambda: self._echo(f"gone/{process.path}", b""))
+
+    def _when_all_is_said(self, answer: Callable[[], None]) -> None:
+        self._door.after_all(lambda: self._echoes.put(answer))
+
+    def _echo(self, key: str, payload: bytes) -> None:
+        self._echoes.put(lambda: self._bus.publish(key, payload))
 
     def _echo_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
-        while (echo := self._echoes.get()) is not None:
-            self._bus.publish(*echo)
+        while True:
+            echoes = deque([self._echoes.get(), *(self._echoes.get() for _ in range(self._echoes.qsize()))])
+            while echoes:
+                first = echoes.popleft()
+                if first is None:
+                    return
+                if isinstance(first, Step):
+                    journal = Journal((first, *_steps_after(first, echoes)))
+                    self._bus.publish(f"j/{first.stage}", pack(journal))
+                else:
+                    first()
 
     def _complain(self, text: str) -> None:
         """Shows a line; it comes back over the bus and is recorded too."""
         self._bus.publish(f"l/{RECORDER}", pack(LogLine(RECORDER, 0, "error", text, time.time_ns())))
+
+
+def _steps_after(first: Step, echoes: deque[_Echo]) -> Iterator[Step]:
+    """Those of the same stage that follow at once: they are echoed together."""
+    while echoes and isinstance(step := echoes[0], Step) and step.stage == first.stage:
+        echoes.popleft()
+        yield step
 
 
 def main() -> int:

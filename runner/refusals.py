@@ -7,8 +7,8 @@ from typing import TypeVar
 import msgspec
 
 from runner import codec
-from runner.bus import Packet
 from runner.codec import CodecError
+from runner.packet import Packet
 
 R = TypeVar("R", bound=msgspec.Struct)
 SHOWN = 10

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ def receive(port: InputPort, envelope: Envelope, *, arrived_ns: int = 0, travell
 class StepContext:
     """What a handler may know of its step (:class:`runner.contract.Context`)."""
 
-    def __init__(self, *, time_ns: int, seed: int, directory: Path, log: Log):
+    def __init__(self, *, time_ns: int, seed: Callable[[], int], directory: Path, log: Log):
+        """``seed`` is asked when random numbers are wanted."""
         self.time_ns = time_ns
         self._seed = seed
         self._rng: np.random.Generator | None = None
@@ -54,7 +56,7 @@ class StepContext:
     def rng(self) -> np.random.Generator:
         """Random numbers of this step, made when they are first asked for."""
         if self._rng is None:
-            self._rng = np.random.default_rng(self._seed)
+            self._rng = np.random.default_rng(self._seed())
         return self._rng
 
     @property
@@ -97,7 +99,7 @@ class Executor:
         """
         driver = driver_of(handler, arrivals)
         context = self._context(handler, driver, time_ns)
-        arguments = _arguments(handler, arrivals)
+        arguments = _arguments(arrivals)
         if handler.context is not None:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
@@ -115,7 +117,7 @@ class Executor:
 
     def _context(self, handler: Handler, driver: Envelope | None, time_ns: int) -> StepContext:
         identity = handler.name if driver is None else driver.id
-        seed = step_seed(self._seed, self._node.name, identity)
+        seed = partial(step_seed, self._seed, self._node.name, identity)
         return StepContext(time_ns=time_ns, seed=seed, directory=self._directory, log=self._log)
 
     def _envelope(
@@ -153,7 +155,8 @@ def step_seed(seed: int, stage: str, identity: str) -> int:
 
 def driver_of(handler: Handler, arrivals: Sequence[Arrival]) -> Envelope | None:
     """The message that seeds the step and hands its lineage on; None for a start."""
-    return next((arrival.envelope for arrival in arrivals if arrival.port == handler.driver), None)
+    name = handler.driver.name if handler.driver is not None else ""
+    return next((arrival.envelope for arrival in arrivals if arrival.port.name == name), None)
 
 
 def step_time(node: Node, arrivals: Sequence[Arrival], now_ns: int) -> int:
@@ -168,11 +171,13 @@ def sequence_of(message_id: str) -> int:
     return int(message_id.rpartition("#")[2])
 
 
-def _arguments(handler: Handler, arrivals: Sequence[Arrival]) -> dict[str, Any]:
+def _arguments(arrivals: Sequence[Arrival]) -> dict[str, Any]:
     arguments: dict[str, Any] = {}
-    for port in handler.inputs:
-        messages = [arrival.message for arrival in arrivals if arrival.port == port]
-        arguments[port.name] = messages if port.kind == "gather" else messages[0]
+    for arrival in arrivals:
+        if arrival.port.kind == "gather":
+            arguments.setdefault(arrival.port.name, []).append(arrival.message)
+        else:
+            arguments[arrival.port.name] = arrival.message
     return arguments
 
 

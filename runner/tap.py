@@ -7,7 +7,8 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from runner.bus import Bus, Packet
+from runner.bus import Bus
+from runner.packet import Packet
 
 BACKLOG = 1000
 """Messages that a slow terminal may fall behind; the rest is left out, and counted."""
@@ -29,7 +30,7 @@ class Header:
         return _HEADER.pack(self.sent_ns, self.arrived_ns, self.size)
 
     @staticmethod
-    def unpack(payload: bytes) -> Header:
+    def unpack(payload: bytes | memoryview) -> Header:
         """Reads what :meth:`pack` wrote."""
         return Header(*_HEADER.unpack(payload))
 

@@ -6,35 +6,38 @@ from typing import Any
 import msgspec
 import pytest
 
-from runner.bus import Process
 from runner.codec import Envelope
-from runner.delivery import PREFETCH, Delivery, Stopped
+from runner.delivery import PREFETCH, Delivery, Payload, Stopped
 from runner.graph import Route
+from runner.packet import Process
 from tests.runner.waiting import wait_until
 
 
 class Wire:
     """Records what is sent, as (replica, id)."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, near: bool = False) -> None:
+        self._near = near
         self.sent: list[tuple[int, str]] = []
         self.stopping = threading.Event()
         self.standing_still = threading.Lock()
         self.sending = ""
 
-    def send(self, path: str, payload: bytes) -> None:
+    def send(self, to: tuple[str, int], key: str, payload: Payload) -> bool:
+        assert isinstance(payload, bytes) and key == f"d/{to[0]}/{to[1]}/input"
         self.sending = payload.decode()
         with self.standing_still:
-            self.sent.append((int(path.split("/")[2]), payload.decode()))
+            self.sent.append((to[1], payload.decode()))
+        return self._near
 
     def take(self) -> list[tuple[int, str]]:
         sent, self.sent = self.sent, []
         return sent
 
 
-def make(**changes: Any) -> tuple[Delivery, Wire]:
+def make(*, near: bool = False, **changes: Any) -> tuple[Delivery, Wire]:
     route = Route("number", "worker", "input", "block", queue=4, shared=False, kept=0)
-    wire = Wire()
+    wire = Wire(near=near)
     routes = [msgspec.structs.replace(route, **changes)]
     return Delivery(routes, wire.send, lambda _: None, wire.stopping.is_set), wire
 

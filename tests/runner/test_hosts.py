@@ -212,8 +212,9 @@ def test_three_machines_with_keys_give_the_bytes_of_one(here, namespaces, partie
     party = parties(namespaces, tmp_path, options).start_all()
     head = party.end("head")
     assert_same_result(head, here)
-    travelled = {step.stage: step.travelled_ns for step in Recording(head.recording).steps}
-    assert (travelled["worker"], travelled["splitter"] > 0) == (0, True)  # clocks of two machines are not compared
+    steps = Recording(head.recording).steps
+    assert not any(step.travelled_ns for step in steps if step.stage == "worker")  # clocks of two are not compared
+    assert any(step.travelled_ns for step in steps if step.stage != "worker")
     assert [party.end(name).code for name in NAMES[1:]] == [0, 0]
 
 

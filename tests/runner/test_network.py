@@ -10,14 +10,15 @@ import pytest
 import zenoh
 
 from runner import bus
-from runner.bus import Bus, Presence, Process, free_endpoint
+from runner.bus import Bus, Presence, free_endpoint
 from runner.codec import Envelope
 from runner.contract import Refused
-from runner.delivery import Delivery
+from runner.delivery import Delivery, Payload
 from runner.document import Document, read_document
 from runner.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
 from runner.hosts import ABSENT_SECONDS, Hello, Hosts, differences, moved
 from runner.network import Host, Layout, read_layout, read_owners
+from runner.packet import Process
 from tests.runner.machines import HOSTS
 from tests.runner.test_runs import DOUBLES, finish, read_until, start
 
@@ -207,8 +208,13 @@ def envelope(number: int) -> Envelope:
 
 def test_an_old_process_that_is_seen_again_takes_nothing_from_its_successor():
     sent: list[str] = []
+
+    def send(_: tuple[str, int], key: str, __: Payload) -> bool:
+        sent.append(key)
+        return False
+
     route = Route("piece", "worker", "piece", "block", 8, shared=True, kept=False)
-    delivery = Delivery([route], lambda path, _: sent.append(path), print, lambda: False)
+    delivery = Delivery([route], send, print, lambda: False)
     old, new = Process("worker", 0, 0), Process("worker", 0, 1)
     delivery.update(old, True)
     delivery.publish("piece", envelope(0), b"")

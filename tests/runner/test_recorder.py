@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runner.bus import RECORDER, Bus, Presence, free_endpoint
+from runner.bus import Bus, Presence, free_endpoint
 from runner.children import last_lines, spawn
 from runner.codec import Envelope, LogLine, Step, encode, envelope, pack
 from runner.contract import Message, Spec
+from runner.packet import RECORDER, Process
 from runner.recorder import EXIT_INCOMPLETE, EXIT_REFUSED, Manifest, topic
 from runner.recording import Recording
 
@@ -34,7 +35,7 @@ class Session:
         self.path = folder / "pictures.mcap"
         self.log = folder / "log.txt"
         endpoint = free_endpoint()
-        self.bus = Bus("test", listen=endpoint)
+        self.bus = Bus("test", listen=endpoint, process=Process("camera", 0))
         graph = '{"name": "pictures", "seed": 0, "view": null, "stages": {"camera": {"replicas": 1}}}'
         task = Manifest("test", endpoint, str(self.path), graph, (), {"camera/picture": topic(Picture)})
         self.process = spawn("runner.recorder", task=msgspec.json.encode(task), log=self.log)
@@ -47,12 +48,12 @@ class Session:
     def send(self, number: int, picture: Picture) -> str:
         own = f"camera.picture#{number}"
         sealed = envelope(picture, id=own, lineage=own, time_ns=number, causes=())
-        self.bus.publish("m/camera/picture", pack(sealed))
+        self.bus.deliver((RECORDER, 0), "m/camera/picture", pack(sealed))
         return own
 
     def journal(self, number: int, *emitted: str) -> None:
         step = Step("camera", 0, 0, number, "source", (), emitted, number, 0, 0, 0)
-        self.bus.publish("s/camera", pack(step))
+        self.bus.deliver((RECORDER, 0), "s/camera", pack(step))
 
     def stop(self) -> int:
         assert self.bus.flush()

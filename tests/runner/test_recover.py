@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from runner.cli import main
 from runner.codec import Step, envelope, pack
 from runner.contract import Refused
+from runner.packet import RECORDER
 from runner.recording import Recording
 from runner.recover import recover
 from runner.supervisor import EXIT_INCOMPLETE
@@ -122,10 +123,10 @@ def publish_until_killed(session: Session, kill: Callable[[], None], seconds: fl
     due, number = time.monotonic() + seconds, 0
     while time.monotonic() < due:
         own, now = f"camera.picture#{number}", time.time_ns()
-        session.bus.publish(
-            "m/camera/picture", pack(envelope(Number(value=0), id=own, lineage=own, time_ns=now, causes=()))
-        )
-        session.bus.publish("s/camera", pack(Step("camera", 0, 0, number, "source", (), (own,), now, 0, 0, 0)))
+        sealed = envelope(Number(value=0), id=own, lineage=own, time_ns=now, causes=())
+        step = Step("camera", 0, 0, number, "source", (), (own,), now, 0, 0, 0)
+        session.bus.deliver((RECORDER, 0), "m/camera/picture", pack(sealed))
+        session.bus.deliver((RECORDER, 0), "s/camera", pack(step))
         number += 1
         time.sleep(0.002)
     killed = time.time_ns()

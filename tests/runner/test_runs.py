@@ -199,7 +199,7 @@ def test_corrupt_bytes_are_refused_and_counted_and_the_process_lives_on(tmp_path
     bus.close()
     assert len(ended.result) == 40
     assert "d/doubler/0/number: message refused (1 so far): Envelope: MessagePack data is malformed" in ended.output
-    assert "j/doubler: message refused (1 so far): Step" in ended.output
+    assert "j/doubler: message refused (1 so far): Journal" in ended.output
 
 
 def test_a_slow_consumer_holds_its_publisher_back(tmp_path: Path):

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from runner.bus import Bus, Process, Router, _badge, free_endpoint
+from runner.bus import Bus, Router, free_endpoint
 from runner.keys import add_keys, credentials, make_keys
 from runner.network import Credentials, Host, Network
+from runner.packet import Process, badge
 from tests.runner.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")
@@ -57,7 +58,8 @@ def table(keys: Path, request: pytest.FixtureRequest) -> Iterator[Table]:
         Network(name, "head", NAMES, "tls/127.0.0.1:0", routed, credentials(keys, name)) for name in NAMES[:2]
     )
     router = [Router(endpoint, own)] if routed else []
-    head = Bus("run", listen=None if routed else endpoint, connect=endpoint if routed else None, network=own)
+    meeting = {"connect": endpoint} if routed else {"listen": endpoint}
+    head = Bus("run", **meeting, network=own, process=Process("counter", 0))
     made = Table(endpoint, head, Bus("run", connect=endpoint, network=other))
     made.worker.subscribe("**", lambda packet: made.arrived.append((packet.key, packet.payload)))
     made.worker.watch(lambda *_: None, lambda key, _: made.present.append(key))
@@ -102,13 +104,13 @@ def try_everything(table: Table, session: zenoh.Session, seconds: float) -> Peer
         ),
         session.liveliness().declare_token(f"run/{STRANGER}"),
     ]
-    table.head.announce(Process("counter", 0))
-    badge = _badge("", "q/status")  # as one who knows the run's secret
+    table.head.announce()
+    shown = badge("", "q/status")  # as one who knows the run's secret
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and not succeeded(table, peer):
         table.head.publish(NUMBER, b"number")
         session.put(f"run/{PIECE}", b"piece")
-        replies = session.get("run/q/status", payload=b"stranger", attachment=badge, timeout=0.5)
+        replies = session.get("run/q/status", payload=b"stranger", attachment=shown, timeout=0.5)
         peer.answers += [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         time.sleep(0.1)
     for declared in keep:

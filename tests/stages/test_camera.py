@@ -27,7 +27,7 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../s
 
 
 def context(seed: int = 0) -> StepContext:
-    return StepContext(time_ns=0, seed=seed, directory=Path(), log=lambda *_: None)
+    return StepContext(time_ns=0, seed=lambda: seed, directory=Path(), log=lambda *_: None)
 
 
 def snapshot() -> Snapshot:
