@@ -120,12 +120,13 @@ class Bus:
         self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._far = network is not None
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._offered: dict[str, _Offer] = {}
         self._process = process
         self._host = network.host if network is not None else ""
         self._present: dict[tuple[str, int], Process] = {}
         """The newest process of each replica."""
-        self._links: dict[Process, Link | None] = {}
-        """To those on this machine; None for the others."""
+        self._links: dict[tuple[str, int], Link | None] = {}
+        """To those of them on this machine; None for the others."""
         self._retired: list[Link] = []
         """Of processes that are gone, as far as they may still read."""
         self._linking = threading.Lock()
@@ -156,29 +157,24 @@ class Bus:
 
         True where it is in that process' hands, or the kernel's, and arrives even if this process dies now.
         """
-        link = self._link_to(to)
+        link = self._links.get(to) or self._connect(to)
         if link is not None and link.send(path, payload):
             return True
         self.publish(path, bytes(payload.view) if isinstance(payload, Block) else payload)
         return False
 
-    def _link_to(self, to: tuple[str, int]) -> Link | None:
-        process = self._present.get(to)
-        if process is None:
-            return None
+    def _connect(self, to: tuple[str, int]) -> Link | None:
+        """The link to a process that is present, made when it is first wanted; None where it is on another machine."""
         with self._linking:
-            if process not in self._links:
-                self._links[process] = self._connect(process)
-            return self._links[process]
-
-    def _connect(self, process: Process) -> Link | None:
-        if self._process is None:
-            return None
-        address = address_of(self._run, self._secret, self._host, process)
-        try:
-            return Link(address, self._secret, self._process.path, self._store)
-        except OSError:
-            return None
+            process = self._present.get(to)
+            if self._process is None or process is None or to in self._links:
+                return self._links.get(to)
+            link = None
+            with contextlib.suppress(OSError):
+                address = address_of(self._run, self._secret, self._host, process)
+                link = Link(address, self._secret, self._process.path, self._store)
+            self._links[to] = link
+            return link
 
     def open_door(self, receive: Callable[[Packet], None], refuse: Callable[[str, Exception], None]) -> Door:
         """Lets those on this machine deliver straight to this process, once it is announced.
@@ -204,24 +200,25 @@ class Bus:
     def _note(self, process: Process, present: bool) -> None:
         """Keeps to the newest process of a replica; the link to an older one lasts as long as that may read."""
         place = process.stage, process.replica
-        newest = self._present.get(place)
-        if present and (newest is None or process > newest):
-            self._present[place] = process
-        elif not present and process == newest:
-            del self._present[place]
-        else:
-            return
         with self._linking:
-            link = self._links.pop(newest, None) if newest is not None else None
+            newest = self._present.get(place)
+            if present and (newest is None or process > newest):
+                self._present[place] = process
+            elif not present and process == newest:
+                del self._present[place]
+            else:
+                return
+            link = self._links.pop(place, None)
         self._retired += [link] if link is not None else []
 
     def offer(self, path: str, payload: bytes | memoryview) -> None:
         """Sends to whoever listens, and to nobody who would have to be waited for."""
-        publisher = self._publishers.get(path) or self._declare(
-            path, zenoh.CongestionControl.DROP, zenoh.Priority.DATA_LOW
-        )
-        if cast("Any", publisher).matching_status.matching:
-            publisher.put(bytes(payload), attachment=self._attachment(path))
+        offered = self._offered.get(path)
+        if offered is None:
+            publisher = self._declare(path, zenoh.CongestionControl.DROP, zenoh.Priority.DATA_LOW)
+            offered = self._offered[path] = _Offer(publisher)
+        if offered.wanted:
+            offered.publisher.put(bytes(payload), attachment=self._attachment(path))
 
     def _declare(
         self, path: str, congestion: zenoh.CongestionControl, priority: zenoh.Priority = zenoh.Priority.DATA
@@ -385,6 +382,19 @@ class Bus:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(1)
+
+
+class _Offer:
+    """A publisher that knows whether anybody listens."""
+
+    def __init__(self, publisher: zenoh.Publisher):
+        self.publisher = publisher
+        self.wanted = False
+        cast("Any", publisher).declare_matching_listener(Callback(self._note, indirect=False))
+        self.wanted = self.wanted or cast("Any", publisher).matching_status.matching
+
+    def _note(self, status: Any) -> None:
+        self.wanted = status.matching
 
 
 class Presence:

@@ -169,7 +169,7 @@ def _from_wire(kind: type, value: Any) -> Any:
     """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
     if isinstance(value, np.ndarray):  # of a message that is checked before it travels
         return cast("Any", value)
-    if get_origin(kind) is not np.ndarray:
+    if getattr(kind, "__origin__", None) is not np.ndarray:
         raise ValueError(f"{kind} cannot be decoded")
     match value:
         case [str() as name, list() as shape, bytes() as data]:
@@ -204,11 +204,11 @@ def _check_array(array: np.ndarray, spec: Spec, place: str) -> None:
 def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
     if len(shape) != len(pattern):
         return False
-    named: dict[int | str, int] = {}
-    return all(
-        extent == (named.setdefault(want, extent) if isinstance(want, str) else want)
-        for extent, want in zip(shape, pattern, strict=True)
-    )
+    named: dict[str, int] = {}
+    for extent, want in zip(shape, pattern, strict=True):
+        if extent != (named.setdefault(want, extent) if isinstance(want, str) else want):
+            return False
+    return True
 
 
 def _shape(extents: Iterable[int | str]) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import cast
 
+import msgspec
+
 from runner.contract import Part
 from runner.graph import Node
 from runner.packet import Packet
@@ -68,8 +70,7 @@ class Mismatched(Exception):
     """A message that contradicts what came before it: another count, or the same index twice."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ready:
+class Ready(msgspec.Struct, frozen=True):
     """A handler and everything it needs, in the order of its parameters."""
 
     handler: Handler

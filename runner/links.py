@@ -37,6 +37,7 @@ _PLACE = struct.Struct("<IQQ")
 _RETURN = struct.Struct("<IQ")
 """The same of a block that is given back."""
 _CREDENTIALS = struct.Struct("3i")
+_TRUNCATED = int(socket.MSG_TRUNC)
 _ANCILLARY_BYTES = socket.CMSG_SPACE(struct.calcsize("i"))
 
 
@@ -330,7 +331,7 @@ def _received(connection: socket.socket, size: int) -> tuple[bytes, Sequence[int
     """
     data, ancillary, flags, _ = connection.recvmsg(size, _ANCILLARY_BYTES)
     descriptors = [one for _, _, packed in ancillary for one in array("i", packed)] if ancillary else ()
-    if flags & socket.MSG_TRUNC:
+    if flags & _TRUNCATED:
         raise CodecError("door", "", f"a packet of more than {size} bytes")
     return data, descriptors
 

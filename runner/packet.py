@@ -7,6 +7,8 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
+import msgspec
+
 from runner.contract import Refused
 
 RECORDER = "recorder"
@@ -34,8 +36,7 @@ class Process:
         return f"{self.stage}/{self.replica}/{self.incarnation}"
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(msgspec.Struct, frozen=True, gc=False):
     """What arrived on a key."""
 
     key: str

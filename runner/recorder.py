@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import signal
 import sys
@@ -54,11 +55,18 @@ LAST_RESORT_SECONDS = 30
 """After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
 EXIT_REFUSED = 2
-REST_SECONDS = 0.004
+REST_SECONDS = 0.005
 """What may come together before the recorder looks again."""
+WRITER_REST_SECONDS = 0.02
+"""What may come together before it is written."""
+ECHO_REST_SECONDS = 0.002
+"""What may come together before it is echoed."""
 BACKLOG_BYTES = 2**30
 """What may wait for the disk; beyond it payloads are dropped, counted, and the recording is INCOMPLETE."""
 
+
+CACHED_BYTES = 2**25
+"""Newest part of a recording that the system keeps in memory, for those who read it as it grows."""
 
 Kind = type[Envelope] | type[Step] | type[LogLine]
 
@@ -230,23 +238,27 @@ class RecordingWriter:
 
     def _write_payloads(self) -> None:
         due = time.monotonic() + FLUSH_SECONDS
-        while True:
-            with contextlib.suppress(queue.Empty):
-                payload = self._queue.get(timeout=max(0.0, due - time.monotonic()))
-                if payload is None:
-                    return
-                if not isinstance(payload, _Payload):
-                    self._flush()
-                    payload()
-                    continue
-                with self._counting:
-                    self._waiting_bytes -= len(payload.data)
-                self._write(payload)
-                if self._file.tell() > self._end:
-                    self._handed_over()
+        while self._write_waiting(due):
+            if self._file.tell() > self._end:
+                self._handed_over()
             if time.monotonic() >= due:
                 self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
+            time.sleep(WRITER_REST_SECONDS)
+
+    def _write_waiting(self, due: float) -> bool:
+        """Writes what waits; waits for something until ``due``. False at the end."""
+        with contextlib.suppress(queue.Empty):
+            payload = self._queue.get(timeout=max(0.0, due - time.monotonic()))
+            while payload is not None:
+                if isinstance(payload, _Payload):
+                    self._write(payload)
+                else:
+                    self._flush()
+                    payload()
+                payload = self._queue.get_nowait()
+            return False
+        return True
 
     def _flush(self) -> None:
         """Closes the chunk by time."""
@@ -258,8 +270,12 @@ class RecordingWriter:
         self._file.flush()
         self._unflushed.clear()
         self._end = self._file.tell()
+        # The system takes the memory of what is on the disk for what comes next; fresh memory costs thrice as much.
+        os.posix_fadvise(self._file.fileno(), 0, max(1, self._end - CACHED_BYTES), os.POSIX_FADV_DONTNEED)
 
     def _write(self, payload: _Payload) -> None:
+        with self._counting:
+            self._waiting_bytes -= len(payload.data)
         try:
             record = unpack(payload.kind, payload.data)
         except CodecError as error:
@@ -458,16 +474,18 @@ class Recorder:
     def _echo_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
         while True:
-            echoes = deque([self._echoes.get(), *(self._echoes.get() for _ in range(self._echoes.qsize()))])
+            first = self._echoes.get()
+            time.sleep(ECHO_REST_SECONDS)
+            echoes = deque([first, *(self._echoes.get() for _ in range(self._echoes.qsize()))])
             while echoes:
-                first = echoes.popleft()
-                if first is None:
+                echo = echoes.popleft()
+                if echo is None:
                     return
-                if isinstance(first, Step):
-                    journal = Journal((first, *_steps_after(first, echoes)))
-                    self._bus.publish(f"j/{first.stage}", pack(journal))
+                if isinstance(echo, Step):
+                    journal = Journal((echo, *_steps_after(echo, echoes)))
+                    self._bus.publish(f"j/{echo.stage}", pack(journal))
                 else:
-                    first()
+                    echo()
 
     def _complain(self, text: str) -> None:
         """Shows a line; it comes back over the bus and is recorded too."""
