@@ -6,11 +6,10 @@ import mmap
 import os
 import threading
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
 
+import msgspec
 import numpy as np
 
 ARENA_BYTES = 2**28
@@ -18,8 +17,7 @@ ARENA_BYTES = 2**28
 ALIGNMENT = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(msgspec.Struct, frozen=True, gc=False):
     """Where a block lies."""
 
     arena: int
@@ -49,8 +47,8 @@ class Store:
 
     def __init__(self) -> None:
         self._arenas: list[_Arena] = []
-        self._lent: Counter[tuple[int, int]] = Counter()
-        """By (arena, offset): readers that have not given it back, and the block itself."""
+        self._held: dict[tuple[int, int], int] = {}
+        """By (arena, offset): how many readers have not given it back, and the block itself."""
         self._given_back: deque[tuple[int, int]] = deque()
         self._changing = threading.Lock()
 
@@ -60,7 +58,7 @@ class Store:
         with self._changing:
             self._settle()
             place = self._find(size)
-            self._lent[place.arena, place.offset] += 1
+            self._held[place.arena, place.offset] = 1
         view = self._arenas[place.arena].view[place.offset : place.offset + size]
         filled = 0
         for part in parts:
@@ -71,7 +69,7 @@ class Store:
     def lend(self, block: Block) -> None:
         """Keeps a block's place until one more reader has given it back."""
         with self._changing:
-            self._lent[block.place.arena, block.place.offset] += 1
+            self._held[block.place.arena, block.place.offset] += 1
 
     def give_back(self, arena: int, offset: int) -> None:
         """One reader does not need a place any more. Never waits: garbage collection may call it at any moment."""
@@ -93,24 +91,24 @@ class Store:
         """Frees what has been given back."""
         while self._given_back:
             key = self._given_back.popleft()
-            self._lent[key] -= 1
-            if self._lent[key] <= 0:
-                del self._lent[key]
+            self._held[key] -= 1
+            if not self._held[key]:
+                del self._held[key]
                 self._arenas[key[0]].release(key[1])
 
     def _find(self, size: int) -> Place:
-        for number, arena in enumerate(self._arenas):
-            offset = arena.take(size)
-            if offset is not None:
-                return Place(number, offset, size)
-        self._arenas.append(_Arena(max(ARENA_BYTES, _aligned(size))))
+        for arena in self._arenas:
+            if (offset := arena.take(size)) is not None:
+                return Place(arena.number, offset, size)
+        self._arenas.append(_Arena(len(self._arenas), max(ARENA_BYTES, _aligned(size))))
         return self._find(size)
 
 
 class _Arena:
     """One stretch of memory; the lowest place that is large enough is taken first, for it has been used before."""
 
-    def __init__(self, size: int):
+    def __init__(self, number: int, size: int):
+        self.number = number
         self.descriptor = os.memfd_create("runner", os.MFD_CLOEXEC)
         os.truncate(self.descriptor, size)
         self.view = memoryview(mmap.mmap(self.descriptor, size))
@@ -144,33 +142,27 @@ class Window:
 
     def __init__(self, descriptor: int):
         """Maps it; raises OSError or ValueError where that is not possible."""
-        self._bytes = np.frombuffer(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ), np.uint8)
-        self._address: int = self._bytes.__array_interface__["data"][0]
+        self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
 
     def read(self, offset: int, size: int, give_back: Callable[[], None]) -> memoryview:
         """A block, without a copy; ``give_back`` is called once nothing refers to it any more.
 
         Raises ValueError where there is none.
         """
-        if offset < 0 or size < 0 or offset + size > len(self._bytes):
-            raise ValueError(f"{size} bytes at {offset} are not within {len(self._bytes)} bytes of shared memory")
-        return np.asarray(_Lease(self._address + offset, size, self._bytes, give_back)).data
+        if offset < 0 or size < 0 or offset + size > len(self._memory):
+            raise ValueError(f"{size} bytes at {offset} are not within {len(self._memory)} bytes of shared memory")
+        lease = _Lease((size,), np.uint8, self._memory, offset)
+        lease.give_back = give_back
+        return lease.data
 
 
-class _Lease:
-    """What every array on a block refers to, however it was made."""
+class _Lease(np.ndarray):
+    """What everything that refers to a block keeps alive."""
 
-    __slots__ = ("__array_interface__", "_give_back", "_memory")
-
-    def __init__(self, address: int, size: int, memory: np.ndarray, give_back: Callable[[], None]):
-        self.__array_interface__: dict[str, Any] = {
-            "data": (address, True), "shape": (size,), "typestr": "|u1", "version": 3
-        }  # fmt: skip
-        self._memory = memory
-        self._give_back = give_back
+    give_back: Callable[[], None]
 
     def __del__(self) -> None:
-        self._give_back()
+        self.give_back()
 
 
 def _aligned(size: int) -> int:

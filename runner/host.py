@@ -316,6 +316,7 @@ class Host:
         self._sent[port] = messages + 1, size + len(payload)
         try:
             self._delivery.publish(port, envelope, payload)
+            os.sched_yield()  # to a consumer that was woken on this processor
         finally:
             if port in self._task.recorded:
                 self._bus.deliver((RECORDER, 0), f"m/{self._process.stage}/{port}", payload)

@@ -504,6 +504,7 @@ def main() -> int:
     what is missing."""
     explain_death()
     die_with_parent(ORPHANED)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     for signum in (signal.SIGINT, signal.SIGHUP):
         signal.signal(signum, signal.SIG_IGN)
     manifest = msgspec.json.decode(sys.stdin.buffer.read(), type=Manifest)
