@@ -22,6 +22,10 @@ Activity = Literal["waiting", "working", "held back"]
 MAX_BYTES = 256 * 2**20
 """Largest payload that is decoded."""
 MAX_DIMENSIONS = 8
+IN_PLACE_BYTES = 2**16
+"""Arrays of larger messages are read where they lie."""
+ALIGNMENT = 16
+"""Of the elements of every array, as memory is allocated anyway: other code may be compiled for other arrays."""
 DTYPES = {
     name: np.dtype(name)
     for name in (
@@ -178,7 +182,7 @@ def _from_wire(kind: type, value: Any) -> Any:
             raise ValueError("expected an array as [dtype, shape, bytes]")
 
 
-def _array(name: str, shape: list[Any], data: bytes) -> np.ndarray:
+def _array(name: str, shape: list[Any], data: bytes | memoryview) -> np.ndarray:
     dtype = DTYPES.get(name)
     if dtype is None:
         raise ValueError(f"element type {name[:20]!r} is not one of {', '.join(DTYPES)}")
@@ -186,7 +190,7 @@ def _array(name: str, shape: list[Any], data: bytes) -> np.ndarray:
         raise ValueError(f"shape {str(shape)[:60]} is not a list of at most {MAX_DIMENSIONS} extents")
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {name}")
-    if dtype is _BOOL and data.strip(b"\x00\x01"):
+    if dtype is _BOOL and bytes(data).strip(b"\x00\x01"):
         raise ValueError("a bool is neither 0 nor 1")
     return np.ndarray(shape, dtype, buffer=data)
 
@@ -309,12 +313,47 @@ def _check_fields(message: Message) -> None:
 
 def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     """Reads one message of a known class; raises CodecError and nothing else, whatever the bytes."""
-    message = _decode(kind, body)
+    message = _decode_in_place(kind, body) if memoryview(body).nbytes > IN_PLACE_BYTES else None
+    if message is None:
+        message = _decode(kind, body)
     try:
         _check_struct(message, "")
     except ValueError as error:
         raise _codec_error(kind.__name__, error) from None
     return message
+
+
+def _decode_in_place(kind: type[M], body: bytes | msgspec.Raw) -> M | None:
+    """Reads a message without copying its arrays; None where something is wrong with it, for others to say what."""
+    fields, values = _field_decoders(kind), dict[str, Any]()
+    try:
+        for name, raw in _decoder(dict[str, msgspec.Raw]).decode(body).items():
+            if name in fields:
+                values[name] = _array_in_place(raw) if fields[name] is None else fields[name].decode(raw)
+        return kind(**values)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError):
+        return None
+
+
+@cache
+def _field_decoders(kind: type[Message]) -> dict[str, Any]:
+    """By field of a message; None for arrays."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: None if _is_array(hints[name]) else _decoder(hints[name]) for name in kind.__struct_fields__}
+
+
+def _is_array(annotation: Any) -> bool:
+    return get_origin(annotation) is Annotated and get_origin(get_args(annotation)[0]) is np.ndarray
+
+
+def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
+    name, shape, data = _decoder(tuple[str, list[Any], memoryview]).decode(raw)
+    array = _array(name, shape, data)
+    if array.itemsize == 1 or array.ctypes.data % ALIGNMENT == 0:
+        return array
+    array = array.copy()
+    array.flags.writeable = False
+    return array
 
 
 def pack(record: Envelope | Step | Journal | Receipt | LogLine | Pulse) -> bytes:

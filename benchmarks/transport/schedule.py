@@ -11,7 +11,7 @@ SIZES = (64, 100_000, 1_000_000, 6_000_000, 40_000_000)
 """Bytes of the arrays."""
 PAUSES = (0.005, 0.005, 0.01, 0.05, 0.3)
 """Seconds between an answer and the next array, so that none waits behind another."""
-WARM_UP = 50
+WARM_UP = 20
 """First messages of each size, which are not counted."""
 
 

@@ -2,6 +2,7 @@
 
 import json
 from typing import Annotated
+from unittest import mock
 
 import jsonschema
 import msgpack
@@ -82,6 +83,38 @@ def test_a_changed_byte_raises_nothing_but_codec_error(message: Sample, data: st
         codec.open_envelope(Sample, codec.unpack(Envelope, bytes(payload)))
     except CodecError as error:
         assert error.reason
+
+
+@given(samples, st.integers(0, 40), st.data())
+def test_arrays_that_are_read_where_they_lie_are_the_same(message: Sample, offset: int, data: st.DataObject):
+    """Also what is wrong with a message is the same, whatever its size."""
+    body = bytearray(codec.encode(message))
+    if data.draw(st.booleans()):
+        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
+    memory = memoryview(bytes(offset) + body)[offset:]
+    with mock.patch.object(codec, "IN_PLACE_BYTES", 0):
+        there = read_or_refuse(memory)
+    assert there == read_or_refuse(bytes(body))
+
+
+def read_or_refuse(body: bytes | memoryview) -> bytes | str:
+    try:
+        read = codec.decode(Sample, msgspec.Raw(body))
+    except CodecError as error:
+        return str(error)
+    assert not read.image.flags.writeable and read.image.flags.aligned
+    return codec.encode(read)
+
+
+def test_large_arrays_are_not_copied_and_others_are_aligned():
+    image, square = np.zeros((200, 300, 3), np.uint8), np.eye(100)
+    body = codec.encode(Sample(image=image, square=square, mask=None, things=(), scale=1.0))
+    for offset in range(16):
+        memory = memoryview(bytes(offset) + body)[offset:]
+        read = codec.decode(Sample, msgspec.Raw(memory))
+        assert np.shares_memory(read.image, np.frombuffer(memory, np.uint8))
+        assert read.square is not None and read.square.ctypes.data % codec.ALIGNMENT == 0
+        np.testing.assert_array_equal(read.square, square)
 
 
 @pytest.mark.parametrize("payload", [b"\x91" * 100_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc1", b""])
