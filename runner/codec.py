@@ -1,6 +1,7 @@
 """What goes over the wire and into recordings: msgpack maps, arrays with a checked type and shape, never pickle."""
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -281,6 +282,10 @@ def _check_items(check: Check | None) -> Check | None:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
+_BIN_32 = b"\xc6"
+"""Byte that begins binary data of more than 64 KiB in msgpack; its length follows in four."""
+_CUT = os.urandom(16)
+"""Stands where an array of a message goes; no message can hold it by itself."""
 
 
 @cache
@@ -295,13 +300,29 @@ def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
 
 def encode(message: Message) -> bytes:
     """The message's bytes; raises CodecError where a field is not what its class declares."""
-    kind = type(message)
+    return b"".join(_encode_in_parts(message))
+
+
+def _encode_in_parts(message: Message) -> tuple[bytes | memoryview, ...]:
+    """What msgspec would write, cut where large arrays lie: they are parts of their own."""
+    arrays: list[memoryview] = []
+
+    def to_wire(value: Any) -> Any:
+        wire = _to_wire(value)
+        if isinstance(wire, list) and value.nbytes > IN_PLACE_BYTES:
+            arrays.append(memoryview(wire[2]).cast("B"))
+            wire[2] = msgspec.Raw(_BIN_32 + value.nbytes.to_bytes(4, "big") + _CUT)
+        return cast("Any", wire)
+
     try:
-        body = _encoder().encode(message)
+        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
         _check_fields(message)
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
-        raise _codec_error(kind.__name__, error) from None
-    return body
+        raise _codec_error(type(message).__name__, error) from None
+    if not arrays:
+        return (body,)
+    first, *others = body.split(_CUT)
+    return (first, *(part for pair in zip(arrays, others, strict=True) for part in pair))
 
 
 def _check_fields(message: Message) -> None:
@@ -361,21 +382,37 @@ def pack(record: Envelope | Step | Journal | Receipt | LogLine | Pulse) -> bytes
     return _encoder().encode(record)
 
 
-def parts(sealed: Envelope) -> tuple[bytes, memoryview]:
-    """What :func:`pack` makes of an envelope, in two parts: a large body is not copied."""
-    return pack(msgspec.structs.replace(sealed, body=msgspec.Raw())), memoryview(sealed.body)
-
-
 def unpack(kind: type[R], payload: bytes | memoryview) -> R:
     """Reads a record; raises CodecError and nothing else, whatever the bytes."""
     return _decode(kind, payload)
 
 
-def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
+class Draft(msgspec.Struct, frozen=True):
+    """An envelope whose body is still in parts: large arrays are not copied, and must not change."""
+
+    cover: Envelope
+    """All but the body."""
+    body: tuple[bytes | memoryview, ...]
+
+    def sealed(self) -> Envelope:
+        """The envelope, with a body of its own."""
+        return msgspec.structs.replace(self.cover, body=msgspec.Raw(b"".join(self.body)))
+
+    def parts(self) -> tuple[bytes | memoryview, ...]:
+        """What :func:`pack` makes of the envelope: a map whose last value is the body."""
+        return pack(self.cover), *self.body
+
+
+def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
     """Wraps a message for its journey; raises CodecError where the message breaks its class."""
     kind = type(message)
-    body = msgspec.Raw(encode(message))
-    return Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, body)
+    cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
+    return Draft(cover, _encode_in_parts(message))
+
+
+def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
+    """Wraps a message as :func:`draft` does, in one piece."""
+    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).sealed()
 
 
 def open_envelope(kind: type[M], sealed: Envelope) -> M:

@@ -19,7 +19,7 @@ import msgspec
 from runner import codec
 from runner.bus import Bus, Presence
 from runner.children import die_with_parent, explain_death, volunteer_for_oom
-from runner.codec import CodecError, Envelope, Journal, LogLine, Outcome, Receipt, Step
+from runner.codec import CodecError, Draft, Envelope, Journal, LogLine, Outcome, Receipt, Step
 from runner.contract import Level, Refused
 from runner.delivery import Delivery, Stopped
 from runner.graph import Route, node_from_entry
@@ -267,11 +267,11 @@ class Host:
     def _step(self, ready: Ready) -> None:
         """Runs one handler to its end and journals it."""
         time_ns = step_time(self._node, ready.arrivals, time.time_ns())
-        emissions = self._executor.run(ready.handler, ready.arrivals, time_ns)
+        emissions = self._executor.drafts(ready.handler, ready.arrivals, time_ns)
         self._present = record = _Record(ready, time_ns)
         try:
-            for envelope in record.timed(emissions):
-                self._emit(envelope)
+            for draft in record.timed(emissions):
+                self._emit(draft)
                 if self._stopping.is_set():
                     raise Stopped
         except Stopped:
@@ -298,19 +298,19 @@ class Host:
         emissions = self._executor.advance(handler, time.time_ns)
         while True:
             self._present = record = _Record(Ready(handler, ()), time.time_ns())
-            for envelope in record.timed(itertools.islice(emissions, 1)):
-                record.time_ns = envelope.time_ns
+            for draft in record.timed(itertools.islice(emissions, 1)):
+                record.time_ns = draft.cover.time_ns
                 with contextlib.suppress(Stopped):
-                    self._emit(envelope)
+                    self._emit(draft)
             self._present = None
             if not record.emitted:
                 return
             self._journal(record)
             yield True
 
-    def _emit(self, envelope: Envelope) -> None:
+    def _emit(self, draft: Draft) -> None:
         """Sends a message: to those who wait for it, then to the recorder, also where the graph ends meanwhile."""
-        payload = self._bus.load(codec.parts(envelope))
+        envelope, payload = draft.cover, self._bus.load(draft.parts())
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
@@ -389,18 +389,18 @@ class _Record:
         begun = self._begun_ns
         return self._computed_ns + (time.monotonic_ns() - begun if begun else 0)
 
-    def timed(self, emissions: Iterator[Envelope]) -> Iterator[Envelope]:
+    def timed(self, emissions: Iterator[Draft]) -> Iterator[Draft]:
         """Passes emissions on, noting their ids and the time the handler took for them."""
         while True:
             self._begun_ns = time.monotonic_ns()
             try:
-                envelope = next(emissions, None)
+                draft = next(emissions, None)
             finally:
                 self._computed_ns, self._begun_ns = self.busy_ns, 0
-            if envelope is None:
+            if draft is None:
                 return
-            self.emitted.append(envelope.id)
-            yield envelope
+            self.emitted.append(draft.cover.id)
+            yield draft
 
     def step(self, process: Process, number: int) -> Step:
         """The journal's record."""

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from runner import codec
-from runner.codec import Envelope
+from runner.codec import Draft, Envelope
 from runner.contract import Level, Message, Stage
 from runner.graph import Node
 from runner.ports import Handler, InputPort, port_name
@@ -90,6 +90,11 @@ class Executor:
         self._numbers = dict(numbers or {})
 
     def run(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Envelope]:
+        """Calls a handler as :meth:`drafts` does and yields what it emits in envelopes."""
+        for draft in self.drafts(handler, arrivals, time_ns):
+            yield draft.sealed()
+
+    def drafts(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Draft]:
         """Calls a handler and yields its messages as it emits them.
 
         ``arrivals`` are in the order of the handler's parameters, the parts of a gather by index;
@@ -104,28 +109,28 @@ class Executor:
         causes = tuple(arrival.envelope.id for arrival in arrivals)
         taken: set[str] = set()
         for message in _messages(getattr(self._stage, handler.name)(**arguments)):
-            yield self._envelope(message, driver, causes, context.time_ns, taken)
+            yield self._draft(message, driver, causes, context.time_ns, taken)
 
-    def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Envelope]:
+    def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft]:
         """Yields the messages of a device's source; each is a step of its own at the clock's time."""
         context = self._context(handler, None, clock())
         arguments = {} if handler.context is None else {handler.context: context}
         for message in getattr(self._stage, handler.name)(**arguments):
             context.time_ns = clock()
-            yield self._envelope(message, None, (), context.time_ns, set())
+            yield self._draft(message, None, (), context.time_ns, set())
 
     def _context(self, handler: Handler, driver: Envelope | None, time_ns: int) -> StepContext:
         identity = handler.name if driver is None else driver.id
         seed = partial(step_seed, self._seed, self._node.name, identity)
         return StepContext(time_ns=time_ns, seed=seed, directory=self._directory, log=self._log)
 
-    def _envelope(
+    def _draft(
         self, message: Message, driver: Envelope | None, causes: tuple[str, ...], time_ns: int, taken: set[str]
-    ) -> Envelope:
+    ) -> Draft:
         port = self._port_of(message)
         own = f"{self._node.name}.{port}#{self._number(port, driver, taken)}"
         lineage = own if driver is None or message.starts_lineage else driver.lineage
-        return codec.envelope(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
+        return codec.draft(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
 
     def _port_of(self, message: Message) -> str:
         port = port_name(type(message))

@@ -69,7 +69,8 @@ def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
 
     for node in graph.nodes.values():
         if node.type.source is not None:
-            for sealed in executors[node.name].advance(node.type.source, time.time_ns):
+            for draft in executors[node.name].advance(node.type.source, time.time_ns):
+                sealed = draft.sealed()
                 sent.append(sealed)
                 yield from [sealed, journalled(node, "source", (), [sealed])]
     while sent:
