@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from runner.bus import Bus
-from runner.children import last_lines, signal_group, spawn
+from runner.children import Family, behind, last_lines, signal_group, spawn
 from runner.contract import Refused
 from runner.document import Document
 from runner.hosts import (
@@ -81,6 +81,7 @@ class Agent:
         bus = Bus(control(name), connect=self._layout.endpoint, network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
+        self._family = Family()
         try:
             return self._take_part(bus)
         finally:
@@ -156,7 +157,8 @@ class Agent:
         process = order.process
         task = msgspec.structs.replace(order.task, directory=str(folder.absolute()), network=self._network)
         log = folder / "log" / f"{process.stage}-{process.replica}.txt"
-        child = _Child(spawn("runner.host", task=msgspec.json.encode(task), log=log), log)
+        mark = self._family.mark(process.path)
+        child = _Child(spawn("runner.host", task=msgspec.json.encode(task), log=log, mark=mark), log)
         self._children[process] = child
         self._say(f"starts {process.stage}.{process.replica}")
         return Started(process, child.handle.pid)
@@ -171,10 +173,12 @@ class Agent:
             child.handle.send_signal(order.signum)
 
     def _reap(self) -> list[Report]:
-        """What has ended since, each with the last that it printed."""
+        """What has ended since, each with the last that it printed, and nothing left of what it had started."""
         ended = [(process, child) for process, child in self._children.items() if child.handle.poll() is not None]
         for process, _ in ended:
             del self._children[process]
+            if left := self._family.end(process.path):
+                self._say(f"{process.stage}.{process.replica} {behind(left)}")
         return [
             Ended(process, child.handle.returncode, "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
             for process, child in ended
@@ -189,6 +193,8 @@ class Agent:
                 child.handle.wait(GRACE_SECONDS)
             signal_group(child.handle, signal.SIGKILL)
             child.handle.wait()
+        if left := self._family.close():
+            self._say(f"the stages {behind(left)}")
 
     def _say(self, text: str) -> None:
         self._terminal.show(self._host, text)

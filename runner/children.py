@@ -1,15 +1,20 @@
-"""Child processes: how they are started, die with their parent and say what went wrong.
+"""Child processes: how they are started, die with their parent, leave nothing behind and say what went wrong.
 
-As a program, ``children.py PARENT COMMAND...``, it becomes a command that dies with its parent, a process id.
+As a program, ``children.py PARENT COMMAND...``, it becomes a command that dies with its parent, a process id;
+``children.py after FAMILY`` waits until stdin is closed and ends a family, see :class:`Family`.
 """
 
 import contextlib
 import ctypes
 import faulthandler
 import os
+import re
+import secrets
 import signal
 import subprocess
 import sys
+import time
+from collections import Counter
 from pathlib import Path
 from typing import Protocol
 
@@ -26,20 +31,33 @@ DUMP = signal.SIGUSR2
 """Makes a child print where it is."""
 PARENT = "RUNNER_PARENT"
 """Names the variable that tells a child who started it."""
+DESCENT = "RUNNER_DESCENT"
+"""Names the variable that tells of which processes of runs a process descends, in whatever session or group it is."""
+DESCENDANT_GRACE_SECONDS = 0.5
+"""What a descendant that is asked to end gets to clean up before it is killed."""
+DESCENDANT_DEATH_SECONDS = 3.0
+"""After that one is given up: the kernel holds it."""
+LOOK_SECONDS = 0.01
+"""Between two looks for descendants. Two must find none: one that is just replaced by another program shows nothing."""
+SHOWN_CHARACTERS = 100
+_AFTER = "after"
 OOM_SCORE = 500
 """The kernel that runs out of memory takes a stage before the recorder and the supervisor, which explain it."""
 _PR_SET_PDEATHSIG = 1
 
 
-def spawn(module: str, *arguments: str, task: bytes, log: Path) -> subprocess.Popen[bytes]:
-    """Starts ``python -m module`` in a process group of its own, with its task on stdin and its output in a file."""
+def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") -> subprocess.Popen[bytes]:
+    """Starts ``python -m module`` in a process group of its own, with its task on stdin and its output in a file.
+
+    What it starts in turn carries its ``mark``, see :class:`Family`.
+    """
     with log.open("ab") as output:
         child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
-            env={**os.environ, **ENVIRONMENT, **_origin(), "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, **ENVIRONMENT, **_origin(mark), "PYTHONUNBUFFERED": "1"},
             process_group=0,
         )
     assert child.stdin is not None
@@ -48,8 +66,83 @@ def spawn(module: str, *arguments: str, task: bytes, log: Path) -> subprocess.Po
     return child
 
 
-def _origin() -> dict[str, str]:
-    return {PARENT: str(os.getpid()), "PYTHONPATH": os.pathsep.join(sys.path)}
+def _origin(mark: str) -> dict[str, str]:
+    descent = " ".join(filter(None, [os.environ.get(DESCENT), mark]))
+    return {PARENT: str(os.getpid()), DESCENT: descent, "PYTHONPATH": os.pathsep.join(sys.path)}
+
+
+class Family:
+    """The children of this process with all that descends from them; none of it outlives this process, even killed.
+
+    Children die by a signal from the kernel, which what they have started does not get: the family's last process ends
+    that. It waits on a pipe that closes when this process ends, in whatever way.
+    """
+
+    def __init__(self) -> None:
+        self._name = secrets.token_hex(8)
+        self._last = subprocess.Popen(
+            [sys.executable, "-I", "-S", __file__, _AFTER, self._name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            process_group=0,
+        )
+
+    def mark(self, path: str) -> str:
+        """What a child is to carry; ``path`` tells it from the others."""
+        return f"{self._name}/{path}"
+
+    def end(self, path: str) -> list[str]:
+        """Ends what a child that has gone has left behind; returns the command lines."""
+        return end_descendants(self.mark(path))
+
+    def close(self) -> list[str]:
+        """Ends what all of them have left behind; returns the command lines."""
+        left = end_descendants(self._name)
+        with self._last:
+            self._last.kill()
+        return left
+
+
+def end_descendants(mark: str) -> list[str]:
+    """Asks all that carry a mark, or one below it, to end, then kills them until none is left; returns their command
+    lines. What has cleared its environment is not found."""
+    ended: dict[int, str] = {}
+    start, clear = time.monotonic(), 0
+    while clear < 2 and (passed := time.monotonic() - start) < DESCENDANT_DEATH_SECONDS:
+        found = _descendants(mark)
+        for pid in found:
+            if passed > DESCENDANT_GRACE_SECONDS:
+                _signal(pid, signal.SIGKILL)
+            elif pid not in ended:
+                _signal(pid, signal.SIGTERM)
+        ended |= found
+        clear = 0 if found else clear + 1
+        time.sleep(LOOK_SECONDS)
+    return list(ended.values())
+
+
+def _descendants(mark: str) -> dict[int, str]:
+    """Command lines of the others that carry a mark, by process id; none where there is no ``/proc``."""
+    pattern = re.compile(rf"(?:^|\0){DESCENT}=(?:[^\0]* )?{re.escape(mark)}(?:[/ \0]|$)".encode())
+    found: dict[int, str] = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has gone, or is another user's
+            if pattern.search((entry / "environ").read_bytes()) and int(entry.name) != os.getpid():
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+                found[int(entry.name)] = line[:SHOWN_CHARACTERS] or f"process {entry.name}"
+    return found
+
+
+def _signal(pid: int, signum: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.kill(pid, signum)
+
+
+def behind(lines: list[str]) -> str:
+    """Says what was left behind, after the name of who left it."""
+    counts = Counter(lines)
+    return f"left behind, ended now: {', '.join(f'{count} x {line}' for line, count in counts.items())}"
 
 
 def die_with_parent(signum: signal.Signals = signal.SIGKILL) -> None:
@@ -118,7 +211,11 @@ def ending(code: int) -> str:
 
 
 def main() -> None:
-    """Becomes the command it is given, which then dies with its parent."""
+    """Becomes the command it is given, which then dies with its parent, or the last process of a family."""
+    if sys.argv[1] == _AFTER:
+        sys.stdin.read()
+        end_descendants(sys.argv[2])
+        return
     _, os.environ[PARENT], *command = sys.argv
     die_with_parent()
     del os.environ[PARENT]

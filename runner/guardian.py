@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from runner.bus import Presence
-from runner.children import DUMP, last_lines, signal_group
+from runner.children import DUMP, behind, last_lines
 from runner.codec import Pulse, Step
 from runner.contract import Level, Refused, Restarted
 from runner.document import suggest
@@ -115,10 +115,12 @@ class Guardian:
                 self._show_output(child)
 
     def end(self) -> str:
-        """Ends the stages, then the recorder and the viewer, and returns the recorder's verdict."""
+        """Ends the stages, then the recorder and the viewer, then what they left; returns the recorder's verdict."""
         end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
         end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
         end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
+        if left := self._launch.close():
+            self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
 
     @property
@@ -240,7 +242,7 @@ class Guardian:
             self._say(f"{name} is killed: {fault}", "warning")
             child.handle.send_signal(DUMP)
         if now > min(child.dies_at, child.retires_by or child.dies_at):
-            signal_group(child.handle, signal.SIGKILL)
+            child.handle.send_signal(signal.SIGKILL)
 
     def _replace(self, child: Child) -> End | None:
         """Has a dead process replaced within its budget; otherwise says why the graph ends."""
@@ -270,6 +272,8 @@ class Guardian:
         """Tells everybody that a process is replaced. What it leaves behind must be known first."""
         child.heir, child.dies_at = (reason, crashes), time.monotonic()
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
+        if left := self._launch.end_rest(child.process):
+            self._say(f"{self._name(child.process)} {behind(left)}", "warning")
 
     def _succeed(self, child: Child, reason: str, crashes: int) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""

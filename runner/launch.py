@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.children import spawn
+from runner.children import Family, spawn
 from runner.family import Child, Progress
 from runner.graph import SUPERVISOR, Graph, graph_to_json, node_entry
 from runner.health import Watch
@@ -67,6 +67,7 @@ class Launcher:
         """``hosts`` are the other machines of the run, None where there are none."""
         self._run = run
         self._hosts = hosts
+        self._family = Family()
 
     def recorder(self) -> Child:
         """Starts what writes the recording."""
@@ -93,8 +94,10 @@ class Launcher:
     def viewer(self) -> Child:
         """Starts the viewer on the recording as it grows."""
         log = self._run.directory / "log" / "viewer.txt"
-        handle = spawn("runner.cli", "view", "--live", str(self._run.recording), task=b"", log=log)
-        return Child(Process("viewer", 0), handle, log)
+        process = Process("viewer", 0)
+        mark = self._family.mark(process.path)
+        handle = spawn("runner.cli", "view", "--live", str(self._run.recording), task=b"", log=log, mark=mark)
+        return Child(process, handle, log)
 
     def stage(self, process: Process, progress: Progress) -> Child:
         """Starts a process of the graph; ``progress`` is how far its stage has come before."""
@@ -104,7 +107,8 @@ class Launcher:
             log = self._run.log_of(process.stage, process.replica)
             child = Child(process, self._hosts.start(host, process, task, log), log)
         else:
-            child = self._spawn(process, "runner.host", msgspec.json.encode(task))
+            mark = self._family.mark(process.path)
+            child = self._spawn(process, "runner.host", msgspec.json.encode(task), mark)
         child.watch = Watch(limits)
         return child
 
@@ -131,7 +135,15 @@ class Launcher:
             past=str(run.recording.absolute()) if relives else "",
         )
 
-    def _spawn(self, process: Process, module: str, task: bytes) -> Child:
+    def end_rest(self, process: Process) -> list[str]:
+        """Ends what a stage's process that has gone has left behind here; returns the command lines."""
+        return self._family.end(process.path)
+
+    def close(self) -> list[str]:
+        """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
+        return self._family.close()
+
+    def _spawn(self, process: Process, module: str, task: bytes, mark: str = "") -> Child:
         log = self._run.log_of(process.stage, process.replica)
         log_from = log.stat().st_size if log.exists() else 0
-        return Child(process, spawn(module, task=task, log=log), log, log_from=log_from)
+        return Child(process, spawn(module, task=task, log=log, mark=mark), log, log_from=log_from)

@@ -3,6 +3,7 @@
 import ctypes
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.contract import Context, Finished, Message, Spec, Stage
+from runner.contract import Context, Finished, Message, Refused, Spec, Stage
 from tests.runner.toys import Answer, Double, Number, Piece
 
 
@@ -80,6 +81,47 @@ class Adder(Stage):
         if number.value in self._config.die_at and first_time(self._config.marks / f"died-{number.value}"):
             os.kill(os.getpid(), signal.SIGKILL)
         return Double(value=self._sum)
+
+
+class Parent(Stage):
+    """Doubles numbers; starts processes in a session of their own, some of which do not end when they are asked to.
+
+    Their ids are lines of the file ``started``. At some numbers it kills itself; beside processes of a predecessor it
+    refuses to live.
+    """
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        marks: Path
+        die_at: tuple[int, ...] = ()
+
+    def __init__(self, config: Config):
+        self._config = config
+        if others := living(config.marks):
+            raise Refused(f"still there: {others}")
+        script = "sleep 1000 & echo $! >> started; trap '' TERM; sleep 2000 & echo $! >> started; echo $$ >> started; "
+        subprocess.Popen(["sh", "-c", f"{script} touch ready; wait"], start_new_session=True, cwd=config.marks)
+        while not (config.marks / "ready").exists():
+            time.sleep(0.01)
+        (config.marks / "ready").unlink()
+
+    def on_number(self, number: Number) -> Double:
+        if number.value in self._config.die_at and first_time(self._config.marks / f"died-{number.value}"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Double(value=2 * number.value)
+
+
+def living(marks: Path) -> list[int]:
+    """Processes that a :class:`Parent` has started and that have not ended."""
+    started = marks / "started"
+    return [pid for pid in map(int, started.read_text().split()) if lives(pid)] if started.exists() else []
+
+
+def lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 class NeverReady(Stage):

@@ -12,7 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from runner.children import DESCENT, Family
 from runner.recording import Recording
+from tests.runner.machines import Party, on_loopback
+from tests.runner.survivors import lives, living
 from tests.runner.test_replay import verify
 from tests.runner.test_runs import DOUBLES, HERE, TOYS, Run, finish, processes_of, read_until, run, start
 from tests.runner.waiting import wait_until
@@ -250,14 +253,62 @@ def test_what_is_bound_to_a_process_dies_with_it():
     wait_until(lambda: "sleep" in Path(f"/proc/{child}/cmdline").read_text())
     parent.kill()
     parent.communicate()
-    wait_until(lambda: not _runs(child))
+    wait_until(lambda: not lives(child))
 
 
-def _runs(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+def test_what_a_stage_has_started_dies_with_the_stage_and_with_the_run(tmp_path: Path):
+    graph = changed(DOUBLES, tmp_path, Doubler="Parent")
+    done = run(graph, tmp_path, f"doubler.marks={tmp_path}", "doubler.die_at=[2]")
+    assert (done.code, done.result) == (0, ["0", "2", "4", "6", "8"]), done.output
+    assert len((tmp_path / "started").read_text().split()) == 6
+    assert living(tmp_path) == []
+    for name in ("doubler", "the stages"):
+        (line,) = re.findall(rf"supervisor +{name} left behind, ended now: (.*)", done.output)
+        assert {"1 x sleep 1000", "1 x sleep 2000"} < set(line.split(", ")), done.output
+
+
+def test_what_stages_have_started_dies_with_a_killed_supervisor(tmp_path: Path):
+    process = start(changed(DOUBLES, tmp_path, Doubler="Parent"), tmp_path, *ENDLESS, f"doubler.marks={tmp_path}")
+    read_until(process, "processes are ready")
+    assert len(living(tmp_path)) == 3
+    process.kill()
+    process.communicate()
+    wait_until(lambda: living(tmp_path) == [] and processes_of(tmp_path) == [])
+
+
+@pytest.mark.slow
+def test_what_stages_have_started_dies_with_a_killed_host(tmp_path: Path):
+    graph = changed(DOUBLES, tmp_path, Doubler="Parent")
+    text = graph.read_text().replace("Parent\n", "Parent\n    host: worker1\n")
+    graph.write_text(f"hosts: {{head: 127.0.0.1:7447, worker1: 127.0.0.1}}\n{text}")
+    party = Party(on_loopback(), tmp_path, graph=graph)
+    head = party.start("head", *ENDLESS, f"doubler.marks={tmp_path}")
+    agent = party.start("worker1")
+    read_until(head, "processes are ready")
+    assert len(living(tmp_path)) == 3
+    agent.kill()
+    wait_until(lambda: living(tmp_path) == [])
+    party.close()
+
+
+def test_a_family_ends_its_own_processes_and_no_others():
+    family, other = Family(), Family()
+    marks = ("worker/0/1", "worker/0/10", "worker/1/0")
+    own = [_sleeper(family.mark(path)) for path in marks]
+    nested = _sleeper(f"{family.mark('worker/1/0')} {other.mark('worker/0/1')}")
+    foreign = _sleeper(other.mark("worker/0/1"))
+    assert family.end("worker/0/1") == ["sleep 600"]
+    assert [child.wait() for child in own[:1]] == [-signal.SIGTERM]
+    assert [child.poll() for child in (*own[1:], nested, foreign)] == [None] * 4
+    assert family.close() == ["sleep 600"] * 3
+    assert [child.wait() for child in (*own[1:], nested)] == [-signal.SIGTERM] * 3
+    assert foreign.poll() is None
+    assert other.close() == ["sleep 600"]
+    foreign.wait()
+
+
+def _sleeper(descent: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(["sleep", "600"], env={**os.environ, DESCENT: descent})
 
 
 # ------------------------------------------------------------------------------------ memory of the machine
