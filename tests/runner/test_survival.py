@@ -1,5 +1,6 @@
 """What goes wrong is found, explained and repaired, and changes no byte of what a graph answers."""
 
+import contextlib
 import os
 import pty
 import re
@@ -281,14 +282,13 @@ def test_what_stages_have_started_dies_with_a_killed_host(tmp_path: Path):
     graph = changed(DOUBLES, tmp_path, Doubler="Parent")
     text = graph.read_text().replace("Parent\n", "Parent\n    host: worker1\n")
     graph.write_text(f"hosts: {{head: 127.0.0.1:7447, worker1: 127.0.0.1}}\n{text}")
-    party = Party(on_loopback(), tmp_path, graph=graph)
-    head = party.start("head", *ENDLESS, f"doubler.marks={tmp_path}")
-    agent = party.start("worker1")
-    read_until(head, "processes are ready")
-    assert len(living(tmp_path)) == 3
-    agent.kill()
-    wait_until(lambda: living(tmp_path) == [])
-    party.close()
+    with contextlib.closing(Party(on_loopback(), tmp_path, graph=graph)) as party:
+        head = party.start("head", *ENDLESS, f"doubler.marks={tmp_path}")
+        agent = party.start("worker1")
+        read_until(head, "processes are ready")
+        assert len(living(tmp_path)) == 3
+        agent.kill()
+        wait_until(lambda: living(tmp_path) == [])
 
 
 def test_a_family_ends_its_own_processes_and_no_others():
