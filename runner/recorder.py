@@ -156,6 +156,8 @@ class RecordingWriter:
         self._counting = threading.Lock()
         self._waiting_bytes = 0
         self._end = self._file.tell()
+        self._unlooked = 0
+        """Bytes since it was last asked whether a chunk has closed."""
         self._unflushed: list[str] = []
         """Ids that the system does not have yet."""
         self._problems: list[str] = []
@@ -239,8 +241,6 @@ class RecordingWriter:
     def _write_payloads(self) -> None:
         due = time.monotonic() + FLUSH_SECONDS
         while self._write_waiting(due):
-            if self._file.tell() > self._end:
-                self._handed_over()
             if time.monotonic() >= due:
                 self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
@@ -253,12 +253,21 @@ class RecordingWriter:
             while payload is not None:
                 if isinstance(payload, _Payload):
                     self._write(payload)
+                    self._hand_over_closed_chunk(len(payload.data))
                 else:
                     self._flush()
                     payload()
                 payload = self._queue.get_nowait()
             return False
         return True
+
+    def _hand_over_closed_chunk(self, size: int) -> None:
+        """After some bytes more: a chunk closes by size too. Not after each few, for the system is asked."""
+        self._unlooked += size
+        if self._unlooked > CHUNK_BYTES // 8:
+            self._unlooked = 0
+            if self._file.tell() > self._end:
+                self._handed_over()
 
     def _flush(self) -> None:
         """Closes the chunk by time."""
