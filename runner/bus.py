@@ -149,8 +149,10 @@ class Bus:
 
     def load(self, parts: Sequence[bytes | memoryview]) -> bytes | Block:
         """The parts of a message as one payload: in memory that consumers can read where it is large."""
-        small = sum(len(part) for part in parts) <= INLINE_BYTES
-        return b"".join(parts) if small else self._store.write(parts)
+        if sum(map(len, parts)) > INLINE_BYTES:
+            with contextlib.suppress(OSError):  # where there is none, Zenoh takes the message
+                return self._store.write(parts)
+        return b"".join(parts)
 
     def deliver(self, to: tuple[str, int], path: str, payload: bytes | Block) -> bool:
         """Sends to one process, (stage, replica), without loss, straight where it is on this machine.

@@ -70,9 +70,9 @@ class Link:
 
     def send(self, key: str, payload: bytes | Block) -> bool:
         """Sends; waits where the other end is full. False where nobody is there any more."""
-        if not isinstance(payload, Block) and len(payload) > INLINE_BYTES:
-            payload = self._store.write([payload])
         try:
+            if not isinstance(payload, Block) and len(payload) > INLINE_BYTES:
+                payload = self._store.write([payload])
             if isinstance(payload, Block):
                 self._lend(payload, key)
             else:

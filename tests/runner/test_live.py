@@ -437,7 +437,7 @@ def test_the_doctor_finds_this_machine_fit_and_a_bad_graph() -> None:
     assert {finding.subject for finding in found} >= {
         "python",
         "packages",
-        "shared memory",
+        "direct link",
         "zenoh",
         "recordings",
         "limits",
