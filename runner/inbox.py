@@ -24,7 +24,7 @@ class Mailbox:
         self._newest: dict[str, Packet] = {}
         self._exchanging = threading.Lock()
         self._come = dict.fromkeys(node.inputs, 0)
-        """By port; the link's thread counts these, the main thread those that it has fetched."""
+        """By port."""
         self._fetched = dict.fromkeys(node.inputs, 0)
         self.replaced = dict.fromkeys(node.inputs, 0)
         """Messages that a newer one replaced before they were decoded."""
@@ -32,12 +32,12 @@ class Mailbox:
     def put(self, packet: Packet) -> None:
         """Takes a packet, from any thread."""
         port = packet.end
-        if port not in self._latest or not packet.genuine:
-            if port in self._come:
-                self._come[port] += 1
-            self._queue.append(packet)
-            return
         with self._exchanging:
+            if port not in self._latest or not packet.genuine:
+                if port in self._come:
+                    self._come[port] += 1
+                self._queue.append(packet)
+                return
             self.replaced[port] += port in self._newest
             if port not in self._newest:
                 self._queue.append(port)

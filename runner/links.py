@@ -227,6 +227,10 @@ class Door:
         with contextlib.suppress(BlockingIOError):
             while True:
                 connection, _ = self._socket.accept()
+                if _user_of(connection) != os.getuid():
+                    self._refuse("door", CodecError("door", "", "another user's process"))
+                    connection.close()
+                    continue
                 connection.setblocking(False)
                 self._guests[connection.fileno()] = _Guest(connection, self._owed)
                 self._epoll.register(connection, select.EPOLLIN)
@@ -247,7 +251,7 @@ class Door:
         descriptor = guest.socket.fileno()
         self._epoll.unregister(descriptor)
         del self._guests[descriptor]
-        guest.socket.close()
+        guest.leave()
 
 
 class _Guest:
@@ -267,7 +271,7 @@ class _Guest:
         """
         try:
             data, descriptors = _received(self.socket, _LONGEST)
-        except ConnectionResetError:
+        except (BlockingIOError, ConnectionResetError):
             return None
         if not data:
             raise EOFError
@@ -278,6 +282,14 @@ class _Guest:
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
+
+    def leave(self) -> None:
+        """Takes no more; what is still read is given back before the socket goes with the last of it."""
+        with contextlib.suppress(OSError):
+            self.socket.shutdown(socket.SHUT_RD)
+
+    def __del__(self) -> None:
+        self.socket.close()
 
     def give_back(self, place: bytes) -> None:
         """Tells the publisher that a block is not needed any more. Never waits, for garbage collection may call it."""
@@ -308,7 +320,7 @@ class _Guest:
         return self._windows[arena].read(offset, size, give_back)
 
     def _require_genuine(self, kind: int, name: str, shown: bytes, secret: str) -> None:
-        if kind != _HELLO or shown != _hello(secret, name) or _user_of(self.socket) != os.getuid():
+        if kind != _HELLO or shown != _hello(secret, name):
             raise CodecError(self.name, "", "not sent by a process of this run")
         self._known, self.name = True, name
 
@@ -332,6 +344,8 @@ def _received(connection: socket.socket, size: int) -> tuple[bytes, Sequence[int
     data, ancillary, flags, _ = connection.recvmsg(size, _ANCILLARY_BYTES)
     descriptors = [one for _, _, packed in ancillary for one in array("i", packed)] if ancillary else ()
     if flags & _TRUNCATED:
+        for descriptor in descriptors:
+            os.close(descriptor)
         raise CodecError("door", "", f"a packet of more than {size} bytes")
     return data, descriptors
 
