@@ -20,13 +20,14 @@ from typing import Literal
 import zenoh
 
 from runner.arena import Store
-from runner.bus import Bus, free_endpoint
+from runner.bus import Bus
 from runner.contract import Refused
 from runner.graph import load_graph
 from runner.info import byte_count
 from runner.links import Door, Link, address_of
 from runner.packet import Packet, Process
 from runner.registry import registry_folder
+from runner.session import free_endpoint
 from runner.tables import from_here
 
 Judgement = Literal["good", "note", "bad"]

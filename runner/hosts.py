@@ -24,7 +24,7 @@ from typing import Any, cast
 
 import msgspec
 
-from runner.bus import Bus, Router, free_endpoint
+from runner.bus import Bus
 from runner.contract import Level, Refused
 from runner.document import Document, read_document, suggest
 from runner.host import Assignment
@@ -32,6 +32,7 @@ from runner.keys import credentials
 from runner.network import Layout, Network
 from runner.packet import Packet, Process
 from runner.provenance import fingerprint, machine, package_versions, revision
+from runner.session import Router, free_endpoint
 
 ABSENT_SECONDS = 60.0
 """How long a host that is cut off may stay away while a stage has no other process."""

@@ -13,7 +13,7 @@ from runner.host import Assignment
 from runner.hosts import Hosts
 from runner.network import Network
 from runner.packet import RECORDER, Process
-from runner.recorder import Manifest, topic
+from runner.writer import Manifest, topic
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import msgspec
 
 from runner import codec
 from runner.backpressure import skipped
-from runner.bus import Bus, free_endpoint
+from runner.bus import Bus
 from runner.calls import CallQuestion, CallRequest, Calls
 from runner.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step
 from runner.contract import Finished, Level, Message, Refused, Restarted
@@ -31,6 +31,7 @@ from runner.packet import RECORDER, Packet, Process
 from runner.ports import port_name
 from runner.refusals import Refusals, admit, require_genuine
 from runner.registry import Entry, Registration, runs
+from runner.session import free_endpoint
 from runner.status import RunStatus, topics_of
 from runner.terminal import Terminal
 

@@ -12,16 +12,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.bus import Bus, Presence, free_endpoint
+from runner.bus import Bus, Presence
 from runner.children import last_lines, spawn
 from runner.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step, envelope, pack, unpack
 from runner.graph import Route, load_graph, node_entry
 from runner.health import PULSE_SECONDS
 from runner.host import Assignment
 from runner.packet import RECORDER, Packet, Process
-from runner.recorder import Manifest
 from runner.recording import Recording
 from runner.refusals import Refusals
+from runner.session import free_endpoint
+from runner.writer import Manifest
 from tests.runner.survivors import Picture
 from tests.runner.test_runs import TOYS, finish, processes_of, read_until, run, start
 from tests.runner.test_survival import ALBUM, changed

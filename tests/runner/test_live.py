@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.bus import Bus, free_endpoint
+from runner.bus import Bus
 from runner.calls import CallQuestion, CallRequest, Calls, Progress
 from runner.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.completion import Shell, script
@@ -29,6 +29,7 @@ from runner.graph import load_graph
 from runner.live import Live
 from runner.recording import Recording
 from runner.registry import Entry, Registration, find_run, registry_folder, runs
+from runner.session import free_endpoint
 from runner.tables import show_progress
 from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
 from tests.runner.test_runs import Run as Finished

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from runner import bus
-from runner.bus import Bus, Presence, free_endpoint
+from runner.bus import Bus, Presence
 from runner.codec import Envelope
 from runner.contract import Refused
 from runner.delivery import Delivery, Payload
@@ -19,6 +19,7 @@ from runner.graph import Graph, Route, graph_from_json, graph_to_json, load_grap
 from runner.hosts import ABSENT_SECONDS, Hello, Hosts, differences, moved
 from runner.network import Host, Layout, read_layout, read_owners
 from runner.packet import Process
+from runner.session import free_endpoint
 from tests.runner.machines import HOSTS
 from tests.runner.test_runs import DOUBLES, finish, read_until, start
 

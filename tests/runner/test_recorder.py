@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runner.bus import Bus, Presence, free_endpoint
+from runner.bus import Bus, Presence
 from runner.children import last_lines, spawn
 from runner.codec import Envelope, LogLine, Step, encode, envelope, pack
 from runner.contract import Message, Spec
 from runner.packet import RECORDER, Process
-from runner.recorder import EXIT_INCOMPLETE, EXIT_REFUSED, Manifest, topic
+from runner.recorder import EXIT_INCOMPLETE, EXIT_REFUSED
 from runner.recording import Recording
+from runner.session import free_endpoint
+from runner.writer import Manifest, topic
 
 HEIGHT, WIDTH = 480, 640
 

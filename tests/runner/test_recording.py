@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner import recorder as recorder_module
+from runner import writer as writer_module
 from runner.codec import Envelope, LogLine, Step, envelope, open_envelope, pack
 from runner.container import Container, Growing, is_being_written
 from runner.contract import Refused
 from runner.graph import load_graph
 from runner.info import describe
 from runner.provenance import file_hashes
-from runner.recorder import RecordingWriter
 from runner.recording import Ledger, Recording, Verdict
+from runner.writer import RecordingWriter
 from tests.runner.recordings import TOYS, manifest, record_toys
 from tests.runner.toys import Number, Total
 
@@ -192,9 +192,9 @@ def test_a_full_disk_ends_the_recording_and_not_the_process(tmp_path: Path):
 def test_a_disk_that_stalls_holds_nobody_up_and_what_does_not_fit_in_memory_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    create, disk = recorder_module._create, threading.Event()
-    monkeypatch.setattr(recorder_module, "_create", lambda path: _StalledDisk(create(path), disk))
-    monkeypatch.setattr(recorder_module, "BACKLOG_BYTES", 5000)
+    create, disk = writer_module._create, threading.Event()
+    monkeypatch.setattr(writer_module, "_create", lambda path: _StalledDisk(create(path), disk))
+    monkeypatch.setattr(writer_module, "BACKLOG_BYTES", 5000)
     path = tmp_path / "stalled.mcap"
     disk.set()
     recorder = writer(path)

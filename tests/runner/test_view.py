@@ -13,9 +13,9 @@ from PIL import Image
 from runner.codec import Envelope, envelope, pack
 from runner.contract import Refused
 from runner.graph import load_graph
-from runner.recorder import RecordingWriter
 from runner.recording import Recording
 from runner.view import follow, load_views, newest_live, save_rrd, screenshot, view_recording
+from runner.writer import RecordingWriter
 from tests.runner.recordings import TOYS, manifest, record_toys
 from tests.runner.toys import Number
 

@@ -11,8 +11,8 @@ from runner import codec
 from runner.contract import Refused
 from runner.graph import load_graph
 from runner.ports import inspect_stage
-from runner.recorder import RecordingWriter
 from runner.step import StepContext
+from runner.writer import RecordingWriter
 from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, SimulatedCamera
 from stages.devices import fetch
 from stages.devices.tabletop import TABLE
