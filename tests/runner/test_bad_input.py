@@ -1,6 +1,7 @@
 """Whatever arrives on whatever key: refused, counted and named; nothing crashes and the graph answers the same."""
 
 import contextlib
+import platform
 import random
 import re
 import time
@@ -133,7 +134,7 @@ class Stray(Bus):
     def _on_pulse(self, packet: Packet) -> None:
         with contextlib.suppress(CodecError):
             pulse = unpack(Pulse, packet.payload)
-            if pulse.pid > 1000:  # no mutation of ours
+            if pulse.host == platform.node():  # no mutation of ours
                 self.refused[pulse.stage] = max(self.refused.get(pulse.stage, 0), pulse.refused)
 
     def meet(self, **keys: str) -> None:
