@@ -224,7 +224,7 @@ class RecordingWriter:
             time.sleep(REST_SECONDS)
 
     def _write_waiting(self, due: float) -> bool:
-        """Writes what waits; waits for something until ``due``. False at the end."""
+        """Writes what waits until ``due``, when a chunk closes; waits for something. False at the end."""
         with contextlib.suppress(queue.Empty):
             payload = self._queue.get(timeout=max(0.0, due - time.monotonic()))
             while payload is not None:
@@ -234,6 +234,8 @@ class RecordingWriter:
                 else:
                     self._flush()
                     payload()
+                if time.monotonic() >= due:
+                    return True
                 payload = self._queue.get_nowait()
             return False
         return True
