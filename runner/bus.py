@@ -135,7 +135,9 @@ class Bus:
         """Sends without loss: a full link blocks. ``path`` is the key without the run. Once closed it sends nothing."""
         if self._closed.is_set():
             return
-        publisher = self._publishers.get(path) or self._declare(path, zenoh.CongestionControl.BLOCK)
+        publisher = self._publishers.get(path)
+        if publisher is None:
+            publisher = self._publishers[path] = self._declare(path, zenoh.CongestionControl.BLOCK)
         publisher.put(payload, attachment=self._attachment(path))
 
     def load(self, parts: Sequence[bytes | memoryview]) -> bytes | Block:
@@ -217,11 +219,9 @@ class Bus:
         self, path: str, congestion: zenoh.CongestionControl, priority: zenoh.Priority = zenoh.Priority.DATA
     ) -> zenoh.Publisher:
         reliable = zenoh.Reliability.RELIABLE
-        publisher = self._session.declare_publisher(
+        return self._session.declare_publisher(
             f"{self._run}/{path}", congestion_control=congestion, priority=priority, reliability=reliable
         )
-        self._publishers[path] = publisher
-        return publisher
 
     def _attachment(self, path: str) -> bytes:
         return _SENT.pack(time.monotonic_ns(), _CLOCK, badge(self._secret, path))
@@ -269,10 +269,11 @@ class Bus:
             except Refused as refusal:
                 refuse(key.removeprefix(f"{self._run}/"), refusal)
             else:
-                if self._far and sample.kind == zenoh.SampleKind.PUT:
+                present = sample.kind == zenoh.SampleKind.PUT
+                if self._far and present:
                     close_dead_links_at_once()
-                self._note(process, sample.kind == zenoh.SampleKind.PUT)
-                callback(process, sample.kind == zenoh.SampleKind.PUT)
+                self._note(process, present)
+                callback(process, present)
 
         subscriber = self._session.liveliness().declare_subscriber(
             f"{self._run}/present/**", self._in_turn(receive), history=True

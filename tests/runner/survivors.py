@@ -62,17 +62,22 @@ class Troubled(Stage):
         os._exit(3)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mortality:
+    """At which numbers a stage kills itself, once each, and where it leaves its marks."""
+
+    marks: Path
+    die_at: tuple[int, ...] = ()
+
+
 class Adder(Stage):
     """Sums numbers: what it emits depends on everything before. At some numbers it kills itself before it answers."""
 
     stateful = True
 
-    @dataclass(frozen=True, slots=True, kw_only=True)
-    class Config:
-        marks: Path
-        die_at: tuple[int, ...] = ()
+    Config = Mortality
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Mortality):
         self._config = config
         self._sum = 0
 
@@ -90,12 +95,9 @@ class Parent(Stage):
     refuses to live.
     """
 
-    @dataclass(frozen=True, slots=True, kw_only=True)
-    class Config:
-        marks: Path
-        die_at: tuple[int, ...] = ()
+    Config = Mortality
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Mortality):
         self._config = config
         if others := living(config.marks):
             raise Refused(f"still there: {others}")
