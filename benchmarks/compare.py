@@ -15,8 +15,8 @@ from pathlib import Path
 from benchmarks.command import command as refusing
 from benchmarks.datasets import detections_file, images, parse_wanted
 from benchmarks.figures import Scored, behind, draw, markdown
-from runner.children import ENVIRONMENT
 from runner.contract import Refused
+from runner.process.children import ENVIRONMENT
 
 TITLES = {
     "digest": "DIGEST",

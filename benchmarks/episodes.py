@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from runner.codec import open_envelope
-from runner.recording import Recording
+from runner.message.codec import open_envelope
+from runner.recording.recording import Recording
 from stages.messages import Outcome, Verdict
 
 M = TypeVar("M", Outcome, Verdict)

@@ -15,9 +15,9 @@ from benchmarks.accuracy import failures, right_sets, score, table
 from benchmarks.command import command
 from benchmarks.datasets import Image, ImageId, detections_file, images, parse_wanted
 from benchmarks.pipeline import Done, Estimate, Pipeline, Step, Steps
-from runner.children import ENVIRONMENT
 from runner.contract import Refused
-from runner.graph import Graph, graph_from_json, graph_to_json, load_graph
+from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph
+from runner.process.children import ENVIRONMENT
 from stages.devices.bop_results import HEADER, Result
 from stages.scene.catalogue import Catalogue
 

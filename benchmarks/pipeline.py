@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Protocol
 
 from benchmarks.datasets import Image
-from runner import codec
-from runner.codec import Envelope
 from runner.contract import Level, Message, Refused
-from runner.graph import Graph
-from runner.inbox import Inbox
-from runner.ports import Handler
-from runner.step import Arrival, Executor, receive, step_time
+from runner.graph.graph import Graph
+from runner.graph.ports import Handler
+from runner.message import codec
+from runner.message.codec import Envelope
+from runner.process.inbox import Inbox
+from runner.process.step import Arrival, Executor, receive, step_time
 from stages.messages import SceneEstimate
 
 _GIVEN = ("camera", "detector")

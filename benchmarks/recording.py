@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from runner.recording import Recording
+from runner.recording.recording import Recording
 
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -59,7 +59,7 @@ def _recorder_seconds(supervisor: int) -> float:
     for task in Path("/proc").glob("[0-9]*"):
         try:
             fields = (task / "stat").read_text().rpartition(")")[2].split()
-            if int(fields[1]) == supervisor and b"runner.recorder" in (task / "cmdline").read_bytes():
+            if int(fields[1]) == supervisor and b"runner.process.recorder" in (task / "cmdline").read_bytes():
                 return (int(fields[11]) + int(fields[12])) / _TICKS
         except (OSError, IndexError):
             continue

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.command import command
 from benchmarks.datasets import Image, detections_file, images
-from runner.children import ENVIRONMENT
+from runner.process.children import ENVIRONMENT
 from stages.perception.combinations import cheapest, ordered
 from stages.perception.composition import FirstLook
 from stages.perception.likelihood import ObservedScene

@@ -18,9 +18,9 @@ import time
 from pathlib import Path
 from statistics import median
 
-from runner.children import ENVIRONMENT
-from runner.graph import Graph, load_graph, node_entry
-from runner.recording import Recording
+from runner.graph.graph import Graph, load_graph, node_entry
+from runner.process.children import ENVIRONMENT
+from runner.recording.recording import Recording
 
 _GRAPH = Path(__file__).parents[1] / "graph.yaml"
 _MESSAGES = 100
@@ -44,7 +44,7 @@ def seconds_to_ready(graph: Path, folder: Path) -> float:
 def seconds_to_construct(graph: Graph) -> float:
     """Wall time to import and set up every stage of a graph, each in a process, all at once and without a runner."""
     code = (
-        "import json, sys; from runner.graph import node_from_entry;"
+        "import json, sys; from runner.graph.graph import node_from_entry;"
         "node_from_entry(sys.argv[1], json.loads(sys.argv[2])).construct()"
     )
     began = time.monotonic()

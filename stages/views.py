@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from runner.contract import Message, Refused
-from runner.drawing import (
+from runner.view.drawing import (
     BarChart,
     Boxes2D,
     Clear,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.provenance import fingerprint, machine, package_versions
-from runner.recording import Recording
+from runner.recording.provenance import fingerprint, machine, package_versions
+from runner.recording.recording import Recording
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "recordings" / "reference.mcap"

@@ -13,7 +13,7 @@ import numpy as np
 import zenoh
 
 from benchmarks.transport.schedule import Schedule
-from runner.session import free_endpoint
+from runner.transport.session import free_endpoint
 
 
 def session(listen: str, connect: str | None) -> zenoh.Session:

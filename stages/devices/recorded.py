@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from runner.codec import open_envelope
 from runner.contract import Refused
+from runner.message.codec import open_envelope
 from stages.messages import Frame
 
 
@@ -16,7 +16,7 @@ class RecordedFrames:
     def __init__(self, path: Path) -> None:
         """Raises :class:`Refused` where the file is no recording or holds no frame."""
         # Only this camera needs the reader and the MCAP library behind it.
-        from runner.recording import Recording
+        from runner.recording.recording import Recording
 
         self._recording = Recording(path)
         self._ids = [id for id, message in self._recording.messages.items() if message.type == Frame.__name__]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.session import free_endpoint
+from runner.transport.session import free_endpoint
 from tests.runner.test_runs import Run
 
 HOSTS = Path(__file__).with_name("hosts.yaml")

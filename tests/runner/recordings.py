@@ -8,12 +8,12 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.codec import Envelope, LogLine, Step, pack
-from runner.graph import Graph, Node, graph_to_json, load_graph
-from runner.inbox import Inbox, Ready
-from runner.recording import RUN, Verdict
-from runner.step import Executor, receive, step_time
-from runner.writer import Manifest, RecordingWriter, topic
+from runner.graph.graph import Graph, Node, graph_to_json, load_graph
+from runner.message.codec import Envelope, LogLine, Step, pack
+from runner.process.inbox import Inbox, Ready
+from runner.process.step import Executor, receive, step_time
+from runner.recording.recording import RUN, Verdict
+from runner.recording.writer import Manifest, RecordingWriter, topic
 
 TOYS = Path(__file__).with_name("toys.yaml")
 Keep = Callable[[Envelope | Step], Envelope | Step | None]

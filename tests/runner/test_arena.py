@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.arena import ALIGNMENT, Block, Store, Window
+from runner.transport.arena import ALIGNMENT, Block, Store, Window
 
 SIZES = st.lists(st.integers(0, 5000), min_size=1, max_size=40)
 

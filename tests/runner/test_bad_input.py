@@ -13,17 +13,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.bus import Bus, Presence
-from runner.children import last_lines, spawn
-from runner.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step, envelope, pack, unpack
-from runner.graph import Route, load_graph, node_entry
-from runner.health import PULSE_SECONDS
-from runner.host import Assignment
-from runner.packet import RECORDER, Packet, Process
-from runner.recording import Recording
-from runner.refusals import Refusals
-from runner.session import free_endpoint
-from runner.writer import Manifest
+from runner.graph.graph import Route, load_graph, node_entry
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step, envelope, pack, unpack
+from runner.message.packet import RECORDER, Packet, Process
+from runner.message.refusals import Refusals
+from runner.process.children import last_lines, spawn
+from runner.process.health import PULSE_SECONDS
+from runner.process.stage_process import Assignment
+from runner.recording.recording import Recording
+from runner.recording.writer import Manifest
+from runner.transport.bus import Bus, Presence
+from runner.transport.session import free_endpoint
 from tests.runner.survivors import Picture
 from tests.runner.test_runs import TOYS, finish, processes_of, read_until, run, start
 from tests.runner.test_survival import ALBUM, changed
@@ -216,8 +216,8 @@ def test_bad_messages_of_the_run_itself_crash_no_process(tmp_path: Path):
         processes=(("glance", 0),),
         secret=secret,
     )
-    recorder = spawn("runner.recorder", task=msgspec.json.encode(manifest), log=tmp_path / "recorder.txt")
-    host = spawn("runner.host", task=msgspec.json.encode(assignment), log=tmp_path / "host.txt")
+    recorder = spawn("runner.process.recorder", task=msgspec.json.encode(manifest), log=tmp_path / "recorder.txt")
+    host = spawn("runner.process.stage_process", task=msgspec.json.encode(assignment), log=tmp_path / "host.txt")
     assert presence.wait_for([(RECORDER, 0), ("glance", 0)], lambda: host.poll() is not None)
     picture = Picture(pixels=np.zeros(100, np.uint8), last=False)
     good: list[Any] = [Receipt("picture", "camera.picture#1"), LogLine("glance", 0, "info", "text", 5)]

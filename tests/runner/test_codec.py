@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from runner import codec
-from runner.codec import CodecError, Envelope, LogLine, Step
 from runner.contract import Message, Spec, Struct
+from runner.message import codec
+from runner.message.codec import CodecError, Envelope, LogLine, Step
 
 Image = Annotated[NDArray[np.uint8], Spec("uint8", ("H", "W", 3))]
 Square = Annotated[NDArray[np.float64], Spec("float64", ("N", "N"))]

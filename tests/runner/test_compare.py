@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from runner.compare import differences
+from runner.inspect.compare import differences
 from tests.runner.toys import Answer
 
 

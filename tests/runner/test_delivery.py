@@ -6,10 +6,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from runner.codec import Envelope
-from runner.delivery import PREFETCH, Delivery, Payload, Stopped
-from runner.graph import Route
-from runner.packet import Process
+from runner.graph.graph import Route
+from runner.message.codec import Envelope
+from runner.message.packet import Process
+from runner.process.delivery import PREFETCH, Delivery, Payload, Stopped
 from tests.runner.waiting import wait_until
 
 

@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from runner import drawing as d
-from runner.cli import main
-from runner.codec import LogLine
+from runner.cli.main import main
 from runner.contract import Refused
-from runner.export import _Scribe, _Sink, export
-from runner.view import RERUN
+from runner.message.codec import LogLine
+from runner.view import drawing as d
+from runner.view.export import _Scribe, _Sink, export
+from runner.view.rerun_view import RERUN
 from tests.runner.recordings import record_toys
 from tests.runner.toy_views import BOXES, DEPTH, FACES, IMAGE, TETRAHEDRON
 

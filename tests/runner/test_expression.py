@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.contract import Message, Refused, Struct
-from runner.expression import MAX_LENGTH, Expression
+from runner.replay.expression import MAX_LENGTH, Expression
 from tests.runner.toys import Answer, Number, Total
 
 

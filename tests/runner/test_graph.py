@@ -7,9 +7,9 @@ import jsonschema
 import pytest
 import yaml
 
-from runner.cli import main
+from runner.cli.main import main
 from runner.contract import Refused
-from runner.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
+from runner.graph.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
 from tests.runner.toys import Add, Collect
 
 HERE = Path(__file__).parent

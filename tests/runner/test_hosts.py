@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from runner.cli import main
-from runner.keys import make_keys
-from runner.network import Host
-from runner.recording import Recording
-from runner.session import free_endpoint
+from runner.cli.main import main
+from runner.graph.placement import Host
+from runner.hosts.keys import make_keys
+from runner.recording.recording import Recording
+from runner.transport.session import free_endpoint
 from tests.runner.machines import HOSTS, NAMES, Machines, Party, in_namespaces, on_loopback, run_here
 from tests.runner.test_runs import Run, processes_of, read_until
 from tests.runner.waiting import wait_until

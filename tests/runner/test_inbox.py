@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runner import codec
 from runner.contract import Message
-from runner.graph import Node, load_graph
-from runner.inbox import Inbox, Mismatched
-from runner.step import Arrival, receive
+from runner.graph.graph import Node, load_graph
+from runner.message import codec
+from runner.process.inbox import Inbox, Mismatched
+from runner.process.step import Arrival, receive
 from tests.runner.toys import Answer, Number, Piece
 
 TOYS = Path(__file__).parent / "toys.yaml"

@@ -5,12 +5,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from runner.causes import Causes, path_to, tree
-from runner.cli import main
-from runner.codec import Envelope, Step
+from runner.cli.main import main
 from runner.contract import Refused
-from runner.latency import critical_paths, latency
-from runner.recording import Recording
+from runner.inspect.causes import Causes, path_to, tree
+from runner.inspect.latency import critical_paths, latency
+from runner.message.codec import Envelope, Step
+from runner.recording.recording import Recording
 from tests.runner.recordings import record_toys
 
 MS = 1_000_000

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-import runner.keys
-from runner.cli import main
+import runner.hosts.keys
+from runner.cli.main import main
 from runner.contract import Refused
-from runner.keys import add_keys, credentials, make_keys
-from runner.network import Host
+from runner.graph.placement import Host
+from runner.hosts.keys import add_keys, credentials, make_keys
 from tests.runner.machines import HOSTS
 
 PAIR = [Host("head", "10.0.0.1"), Host("arm", "lab.local")]
@@ -72,7 +72,7 @@ def test_only_good_credentials_are_used(tmp_path: Path):
 
 
 def test_a_certificate_that_has_ended_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(runner.keys, "HOST_DAYS", -0.5)
+    monkeypatch.setattr(runner.hosts.keys, "HOST_DAYS", -0.5)
     make_keys(tmp_path, PAIR)
     day = (datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=0.5)).date()
     with pytest.raises(Refused, match=f"ended on {day}; remove .* and make another: runner keys add"):

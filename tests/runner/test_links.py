@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from runner.arena import Store
-from runner.links import INLINE_BYTES, Door, Link, address_of
-from runner.packet import Packet, Process
+from runner.message.packet import Packet, Process
+from runner.transport.arena import Store
+from runner.transport.links import INLINE_BYTES, Door, Link, address_of
 from tests.runner.waiting import wait_until
 
 SECRET = "secret"
@@ -107,8 +107,8 @@ def test_memory_comes_back_when_the_reader_is_gone():
 
 PUBLISHER = """
 import sys, time
-from runner.arena import Store
-from runner.links import Link
+from runner.transport.arena import Store
+from runner.transport.links import Link
 link = Link(bytes.fromhex(sys.argv[1]), "secret", "publisher/0/0", Store())
 for number in range(40):
     link.send("k", number.to_bytes(4, "big") * (10 if number % 2 else 5000))

@@ -18,19 +18,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.bus import Bus
-from runner.calls import CallQuestion, CallRequest, Calls, Progress
-from runner.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
-from runner.completion import Shell, script
+from runner.cli.completion import Shell, script
+from runner.cli.doctor import examine, examine_graph
 from runner.contract import Refused
-from runner.doctor import examine, examine_graph
-from runner.echo import lines_of
-from runner.graph import load_graph
-from runner.live import Live
-from runner.recording import Recording
-from runner.registry import Entry, Registration, find_run, registry_folder, runs
-from runner.session import free_endpoint
-from runner.tables import show_progress
+from runner.graph.graph import load_graph
+from runner.inspect.echo import lines_of
+from runner.live.live import Live
+from runner.live.tables import show_progress
+from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
+from runner.recording.recording import Recording
+from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
+from runner.supervise.registry import Entry, Registration, find_run, registry_folder, runs
+from runner.transport.bus import Bus
+from runner.transport.session import free_endpoint
 from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
@@ -450,7 +450,7 @@ def test_the_doctor_finds_this_machine_fit_and_a_bad_graph() -> None:
 
 
 def test_the_doctor_says_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runner.doctor.LEAST_DISK", 10**18)
+    monkeypatch.setattr("runner.cli.doctor.LEAST_DISK", 10**18)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "runner").mkdir(mode=0o755)
     found = {finding.subject: finding for finding in examine(tmp_path)}

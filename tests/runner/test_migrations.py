@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from runner.codec import CodecError, Envelope, decode_untyped, open_envelope
-from runner.migrations import Migration, migrated, without_gained_fields
-from runner.recording import Recording
-from runner.replay import verify
+from runner.message.codec import CodecError, Envelope, decode_untyped, open_envelope
+from runner.recording.migrations import Migration, migrated, without_gained_fields
+from runner.recording.recording import Recording
+from runner.replay.replay import verify
 from tests.runner.recordings import rewrite
 from tests.runner.weather import Forecast, Reading
 

@@ -9,17 +9,17 @@ import msgspec
 import pytest
 import zenoh
 
-from runner import bus
-from runner.bus import Bus, Presence
-from runner.codec import Envelope
 from runner.contract import Refused
-from runner.delivery import Delivery, Payload
-from runner.document import Document, read_document
-from runner.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
-from runner.hosts import ABSENT_SECONDS, Hello, Hosts, differences, moved
-from runner.network import Host, Layout, read_layout, read_owners
-from runner.packet import Process
-from runner.session import free_endpoint
+from runner.graph.document import Document, read_document
+from runner.graph.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
+from runner.graph.placement import Host, Layout, read_layout, read_owners
+from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, differences, moved
+from runner.message.codec import Envelope
+from runner.message.packet import Process
+from runner.process.delivery import Delivery, Payload
+from runner.transport import bus
+from runner.transport.bus import Bus, Presence
+from runner.transport.session import free_endpoint
 from tests.runner.machines import HOSTS
 from tests.runner.test_runs import DOUBLES, finish, read_until, start
 

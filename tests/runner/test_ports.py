@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from runner.contract import Context, Refused, Stage
-from runner.ports import inspect_stage, port_name
+from runner.graph.ports import inspect_stage, port_name
 from tests.runner.toys import Account, Add, Answer, Collect, Double, Gatherer, Number, Piece, Total, Worker
 
 

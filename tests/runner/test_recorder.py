@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runner.bus import Bus, Presence
-from runner.children import last_lines, spawn
-from runner.codec import Envelope, LogLine, Step, encode, envelope, pack
 from runner.contract import Message, Spec
-from runner.packet import RECORDER, Process
-from runner.recorder import EXIT_INCOMPLETE, EXIT_REFUSED
-from runner.recording import Recording
-from runner.session import free_endpoint
-from runner.writer import Manifest, topic
+from runner.message.codec import Envelope, LogLine, Step, encode, envelope, pack
+from runner.message.packet import RECORDER, Process
+from runner.process.children import last_lines, spawn
+from runner.process.recorder import EXIT_INCOMPLETE, EXIT_REFUSED
+from runner.recording.recording import Recording
+from runner.recording.writer import Manifest, topic
+from runner.transport.bus import Bus, Presence
+from runner.transport.session import free_endpoint
 
 HEIGHT, WIDTH = 480, 640
 
@@ -40,7 +40,7 @@ class Session:
         self.bus = Bus("test", listen=endpoint, process=Process("camera", 0))
         graph = '{"name": "pictures", "seed": 0, "view": null, "stages": {"camera": {"replicas": 1}}}'
         task = Manifest("test", endpoint, str(self.path), graph, (), {"camera/picture": topic(Picture)})
-        self.process = spawn("runner.recorder", task=msgspec.json.encode(task), log=self.log)
+        self.process = spawn("runner.process.recorder", task=msgspec.json.encode(task), log=self.log)
         self._presence = Presence()
         self.bus.watch(self._presence.update)
 

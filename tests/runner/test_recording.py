@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner import writer as writer_module
-from runner.codec import Envelope, LogLine, Step, envelope, open_envelope, pack
-from runner.container import Container, Growing, is_being_written
 from runner.contract import Refused
-from runner.graph import load_graph
-from runner.info import describe
-from runner.provenance import file_hashes
-from runner.recording import Ledger, Recording, Verdict
-from runner.writer import RecordingWriter
+from runner.graph.graph import load_graph
+from runner.inspect.info import describe
+from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelope, pack
+from runner.recording import writer as writer_module
+from runner.recording.container import Container, Growing, is_being_written
+from runner.recording.provenance import file_hashes
+from runner.recording.recording import Ledger, Recording, Verdict
+from runner.recording.writer import RecordingWriter
 from tests.runner.recordings import TOYS, manifest, record_toys
 from tests.runner.toys import Number, Total
 

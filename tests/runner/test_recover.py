@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from runner.cli import main
-from runner.codec import Step, envelope, pack
+from runner.cli.main import main
 from runner.contract import Refused
-from runner.packet import RECORDER
-from runner.recording import Recording
-from runner.recover import recover
-from runner.supervisor import EXIT_INCOMPLETE
+from runner.message.codec import Step, envelope, pack
+from runner.message.packet import RECORDER
+from runner.recording.recording import Recording
+from runner.recording.recover import recover
+from runner.supervise.supervisor import EXIT_INCOMPLETE
 from tests.runner.recordings import record_toys, rewrite
 from tests.runner.test_recorder import Session
 from tests.runner.test_runs import DOUBLES, processes_of, start
@@ -169,7 +169,9 @@ def children(process: subprocess.Popen[str]) -> list[int]:
 
 
 def recorder_of(process: subprocess.Popen[str]) -> int:
-    (pid,) = (pid for pid in children(process) if b"runner.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    (pid,) = (
+        pid for pid in children(process) if b"runner.process.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    )
     return pid
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from runner.codec import Envelope, Step, decode, envelope, pack, unpack
-from runner.recording import Recording
+from runner.message.codec import Envelope, Step, decode, envelope, pack, unpack
+from runner.recording.recording import Recording
 from tests.runner.recordings import record_toys, rewrite
 from tests.runner.toys import Answer
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from runner.bus import Bus
 from runner.contract import Refused
-from runner.recording import Recording
-from runner.replay import verify
+from runner.recording.recording import Recording
+from runner.replay.replay import verify
+from runner.transport.bus import Bus
 
 HERE = Path(__file__).parent
 TOYS = HERE / "toys.yaml"

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from runner.bus import Bus
-from runner.keys import add_keys, credentials, make_keys
-from runner.network import Credentials, Host, Network
-from runner.packet import Process, badge
-from runner.session import Router, free_endpoint
+from runner.graph.placement import Credentials, Host, Network
+from runner.hosts.keys import add_keys, credentials, make_keys
+from runner.message.packet import Process, badge
+from runner.transport.bus import Bus
+from runner.transport.session import Router, free_endpoint
 from tests.runner.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")

@@ -1,7 +1,7 @@
 import numpy as np
 
-from runner.compare import differences
-from runner.summary import Summary
+from runner.inspect.compare import differences
+from runner.inspect.summary import Summary
 from tests.runner.toys import Answer
 
 

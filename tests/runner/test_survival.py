@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.children import DESCENT, Family
-from runner.recording import Recording
+from runner.process.children import DESCENT, Family
+from runner.recording.recording import Recording
 from tests.runner.machines import Party, on_loopback
 from tests.runner.survivors import lives, living
 from tests.runner.test_replay import verify
@@ -246,7 +246,7 @@ def test_a_closed_pipe_does_not_end_the_graph(tmp_path: Path):
 
 
 def test_what_is_bound_to_a_process_dies_with_it():
-    script = "import subprocess, time; from runner.children import bound; "
+    script = "import subprocess, time; from runner.process.children import bound; "
     script += "child = subprocess.Popen(bound(['sleep', '600'])); print(child.pid, flush=True); time.sleep(600)"
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
@@ -343,7 +343,7 @@ def test_a_process_that_the_kernel_kills_for_memory_is_named(small_group: Path, 
     procs = small_group / "cgroup.procs"
     settings = (f"worker.marks={tmp_path}", "worker.grow_at=2", "worker.grow_bytes=3000000000", "worker.replicas=1")
     script = "import os, sys; from pathlib import Path; Path(sys.argv[1]).write_text(str(os.getpid())); "
-    script += "sys.argv = ['runner', *sys.argv[2:]]; from runner.cli import main; sys.exit(main())"
+    script += "sys.argv = ['runner', *sys.argv[2:]]; from runner.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", script, str(procs), "up", str(graph), "--recordings", str(tmp_path)]
     command += [part for setting in (f"sink.path={tmp_path / 'out.txt'}", *settings) for part in ("--set", setting)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.children import ENVIRONMENT
-from runner.cli import main
+from runner.cli.main import main
+from runner.process.children import ENVIRONMENT
 from tests.runner.recordings import record_toys
 
 

@@ -10,12 +10,12 @@ import pytest
 import rerun as rr
 from PIL import Image
 
-from runner.codec import Envelope, envelope, pack
 from runner.contract import Refused
-from runner.graph import load_graph
-from runner.recording import Recording
-from runner.view import follow, load_views, newest_live, save_rrd, screenshot, view_recording
-from runner.writer import RecordingWriter
+from runner.graph.graph import load_graph
+from runner.message.codec import Envelope, envelope, pack
+from runner.recording.recording import Recording
+from runner.recording.writer import RecordingWriter
+from runner.view.rerun_view import follow, load_views, newest_live, save_rrd, screenshot, view_recording
 from tests.runner.recordings import TOYS, manifest, record_toys
 from tests.runner.toys import Number
 
@@ -85,7 +85,7 @@ def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
 
 
 def test_the_viewer_listens_on_loopback_only(monkeypatch: pytest.MonkeyPatch):
-    from runner import view
+    from runner.view import rerun_view as view
 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

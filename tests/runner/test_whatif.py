@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from runner.children import ENVIRONMENT
-from runner.cli import main
-from runner.codec import decode
+from runner.cli.main import main
 from runner.contract import Message
-from runner.recording import Recording
+from runner.message.codec import decode
+from runner.process.children import ENVIRONMENT
+from runner.recording.recording import Recording
 from tests.runner.recordings import record_toys
 from tests.runner.test_replay import replay
 from tests.runner.toys import Answer, Gatherer, Number, Total

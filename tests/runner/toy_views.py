@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from runner import drawing as d
 from runner.contract import Message
+from runner.view import drawing as d
 from tests.runner.toys import Answer, Number, Total
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])

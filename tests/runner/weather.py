@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Context, Finished, Message, Spec, Stage, Struct
-from runner.migrations import MIGRATIONS, Migration
+from runner.recording.migrations import MIGRATIONS, Migration
 
 Vector = Annotated[NDArray[np.float64], Spec("float64", ("N",))]
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import stages.scene
-from runner import codec
 from runner.contract import Refused
-from runner.graph import load_graph
-from runner.ports import inspect_stage
-from runner.step import StepContext
-from runner.writer import RecordingWriter
+from runner.graph.graph import load_graph
+from runner.graph.ports import inspect_stage
+from runner.message import codec
+from runner.process.step import StepContext
+from runner.recording.writer import RecordingWriter
 from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, SimulatedCamera
 from stages.devices import fetch
 from stages.devices.tabletop import TABLE

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runner.contract import Message, Refused
-from runner.drawing import (
+from runner.view.drawing import (
     BarChart,
     Boxes2D,
     Clear,

@@ -1,0 +1,103 @@
+"""Commands on graph files: ``up``, ``check``, ``graph``, ``schema``."""
+
+import argparse
+import json
+from pathlib import Path
+
+from runner.cli.commands import Commands, add, add_graph
+
+
+def add_commands(commands: Commands) -> None:
+    """Adds the commands of this group."""
+    up = add(commands, "up", _up, "run a graph, record it, and exit as it ends")
+    add_graph(up)
+    up.add_argument("--seed", type=int, help="root of all random numbers (short for --set seed=N)")
+    where = up.add_mutually_exclusive_group()
+    where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
+    where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
+    up.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go")
+    seen = up.add_mutually_exclusive_group()
+    seen.add_argument("--view", action="store_true", help="open the viewer")
+    seen.add_argument("--steps-only", action="store_true", help="record no messages: nothing can be replayed")
+    add_graph(add(commands, "check", _check, "check a graph file: keys, settings, classes and every edge's type"))
+    add_graph(add(commands, "graph", _graph, "print a graph as a Mermaid flow chart"))
+    add(commands, "schema", _schema, "print the JSON Schema of graph files")
+
+
+def _up(options: argparse.Namespace) -> int:
+    from runner.graph.graph import load_graph
+    from runner.supervise.supervisor import Supervisor
+    from runner.terminal import Terminal
+
+    seed = [] if options.seed is None else [f"seed={options.seed}"]
+    settings = (*options.settings, *seed)
+    host = None if options.here else _chosen_host(options.graph, settings, options.host)
+    terminal = Terminal()
+    if host is not None:
+        return _take_part(options, settings, host)
+    graph = load_graph(options.graph, settings)
+    graph = graph.here() if options.here else graph
+    supervisor = Supervisor(
+        graph,
+        file=options.graph,
+        recordings=options.recordings,
+        settings=settings,
+        terminal=terminal,
+        steps_only=options.steps_only,
+    )
+    end = supervisor.run(view=options.view)
+    terminal.plain(end.reason)
+    return end.code
+
+
+def _chosen_host(file: Path, settings: tuple[str, ...], name: str | None) -> str | None:
+    """The host that this machine is, None where it has the supervisor; raises Refused where that is not clear."""
+    from runner.graph.document import read_document
+    from runner.graph.placement import choose_host, read_layout
+
+    document = read_document(file)
+    for setting in settings:
+        document.set(setting)
+    layout = read_layout(document)
+    chosen = choose_host(layout, name, file)
+    return None if not layout.hosts or chosen == layout.head.name else chosen
+
+
+def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str) -> int:
+    from runner.graph.document import read_document
+    from runner.hosts.agent import Agent, refuse_settings
+    from runner.terminal import Terminal
+
+    document = read_document(options.graph)
+    refuse_settings(settings, host)
+    for setting in settings:
+        document.set(setting)
+    terminal = Terminal()
+    end = Agent(document, host, recordings=options.recordings, terminal=terminal).run()
+    terminal.plain(end.reason)
+    return end.code
+
+
+def _check(options: argparse.Namespace) -> int:
+    from runner.graph.graph import load_graph
+
+    graph = load_graph(options.graph, options.settings)
+    commands = len(graph.commands())
+    edges = sum(len(node.inputs) for node in graph.nodes.values()) - commands
+    counts = (f"{len(graph.nodes)} stages", f"{len(graph.processes())} processes", f"{edges} edges")
+    print(f"{options.graph}: {', '.join(counts)}{f', {commands} commands' if commands else ''}: good")
+    return 0
+
+
+def _graph(options: argparse.Namespace) -> int:
+    from runner.graph.graph import load_graph, mermaid
+
+    print(mermaid(load_graph(options.graph, options.settings)))
+    return 0
+
+
+def _schema(_: argparse.Namespace) -> int:
+    from runner.graph.graph import graph_schema
+
+    print(json.dumps(graph_schema(), indent=2))
+    return 0

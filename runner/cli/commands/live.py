@@ -1,0 +1,181 @@
+"""Commands on graphs that run: ``ps``, ``logs``, ``topic``, ``call``, ``restart``, ``down``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from runner.cli import completion
+from runner.cli.commands import Commands, add
+from runner.cli.completion import completed
+from runner.contract import Refused
+
+
+def add_commands(commands: Commands) -> None:
+    """Adds the commands of this group."""
+    _add_run(add(commands, "ps", _ps, "show the graphs that run and how each of their processes is"))
+    _add_logs(commands)
+    _add_topic(commands)
+    call = add(commands, "call", _call, "have a stage do what it can be asked, and wait until it is done")
+    stage = call.add_argument("stage", metavar="STAGE", nargs="?", help="without a command: lists what it can be asked")
+    completed(stage, completion.callable_stages)
+    completed(call.add_argument("name", metavar="COMMAND", nargs="?"), completion.command_names)
+    fields = call.add_argument("fields", metavar="FIELD=VALUE", nargs="*", help="for example name=breakfast")
+    completed(fields, completion.fields)
+    _add_run(call)
+    restart = add(commands, "restart", _restart, "replace a process in order: it finishes its step, nothing is lost")
+    completed(restart.add_argument("process", metavar="STAGE[.REPLICA]"), completion.processes)
+    _add_run(restart)
+    _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    text = "which run, where several live; the beginning of its name will do"
+    completed(parser.add_argument("--run", metavar="NAME", help=text), completion.run_names)
+
+
+def _add_logs(commands: Commands) -> None:
+    logs = add(commands, "logs", _logs, "show what the stages of the running graph say, or of the last one")
+    stage = logs.add_argument(
+        "stage", metavar="STAGE", nargs="?", help="only this one, with what its processes printed"
+    )
+    completed(stage, completion.stages)
+    logs.add_argument("-f", "--follow", action="store_true", help="go on until the graph ends")
+    logs.add_argument(
+        "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where the last run is"
+    )
+    _add_run(logs)
+
+
+def _add_topic(commands: Commands) -> None:
+    topic = commands.add_parser("topic", help="look at what flows", description="Look at what flows.")
+    verbs = topic.add_subparsers(required=True, metavar="VERB")
+    _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
+    echo = add(verbs, "echo", _topic_echo, "print messages as they come, whatever their type")
+    completed(echo.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
+    echo.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many messages")
+    _add_run(echo)
+    for name, text in (("hz", "how often messages come"), ("bw", "how many bytes flow")):
+        measure = add(verbs, name, _topic_rate, f"{text}, from their headers alone")
+        completed(measure.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
+        measure.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many lines, one a second")
+        measure.set_defaults(measure=name)
+        _add_run(measure)
+
+
+def _ps(options: argparse.Namespace) -> int:
+    from runner.live.live import Live
+    from runner.live.tables import status_text
+    from runner.supervise.registry import find_run, runs
+
+    living = [find_run(options.run)] if options.run else runs()
+    for number, entry in enumerate(living):
+        try:
+            with Live(entry) as live:
+                text = status_text(live.status())
+        except Refused as refusal:  # it has just ended, or it hangs
+            text = str(refusal)
+        print("\n" * (number > 0) + text)
+    if not living:
+        print("no graph is running on this machine")
+    return 0
+
+
+def _logs(options: argparse.Namespace) -> int:
+    from runner.inspect.logs import log_lines, newest_recording, printed_lines
+    from runner.live.tables import show_lines
+    from runner.supervise.registry import find_run, runs
+
+    running = bool(options.run) or bool(runs())
+    path = Path(find_run(options.run).recording) if running else newest_recording(options.recordings)
+    show_lines(path, log_lines(path, follow=options.follow), options.stage)
+    if options.stage and not options.follow:
+        for process, line in printed_lines(path, options.stage):
+            print(f"{process} | {line}")
+    return 0
+
+
+def _topic_list(options: argparse.Namespace) -> int:
+    from runner.live.live import Live
+    from runner.live.tables import topics_text
+    from runner.supervise.registry import find_run
+
+    with Live(find_run(options.run)) as live:
+        print(topics_text(live.status()))
+    return 0
+
+
+def _topic_echo(options: argparse.Namespace) -> int:
+    from runner.inspect.echo import lines_of
+    from runner.live.live import Live
+    from runner.supervise.registry import find_run
+
+    left = options.count
+    with Live(find_run(options.run)) as live:
+        for packet in live.messages(options.topic):
+            print("\n".join(lines_of(packet.payload)), flush=True)
+            left = None if left is None else left - 1
+            if left == 0:
+                break
+    return 0
+
+
+def _topic_rate(options: argparse.Namespace) -> int:
+    from runner.live.live import Live
+    from runner.live.tables import bandwidth_text, rate_text
+    from runner.supervise.registry import find_run
+
+    text = rate_text if options.measure == "hz" else bandwidth_text
+    left = options.count
+    with Live(find_run(options.run)) as live:
+        for headers in live.headers(options.topic):
+            print(text(headers), flush=True)
+            left = None if left is None else left - 1
+            if left == 0:
+                break
+    return 0
+
+
+def _call(options: argparse.Namespace) -> int:
+    from runner.live.live import Live
+    from runner.live.tables import commands_text, show_progress
+    from runner.supervise.calls import CallRequest
+    from runner.supervise.registry import find_run
+
+    with Live(find_run(options.run)) as live:
+        if options.name is None:
+            print(commands_text(live.commands(), options.stage))
+            return 0
+        live.wait_until_ready(print)
+        request = CallRequest(options.stage, options.name, dict(map(_field, options.fields)))
+        id = live.call(request)
+        return show_progress(id, options.stage, live.follow(id))
+
+
+def _field(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise Refused(f"{text}: expected field=value, for example name=breakfast")
+    return name, value
+
+
+def _restart(options: argparse.Namespace) -> int:
+    from runner.live.live import Live
+    from runner.supervise.registry import find_run
+
+    with Live(find_run(options.run)) as live:
+        print(live.restart(options.process))
+    return 0
+
+
+def _down(options: argparse.Namespace) -> int:
+    from runner.live.live import Live, wait_until_gone
+    from runner.live.tables import from_here
+    from runner.supervise.registry import find_run
+
+    entry = find_run(options.run)
+    with Live(entry) as live:
+        live.down()
+    wait_until_gone(entry)
+    print(f"{entry.run} has ended; recording {from_here(entry.recording)}")
+    return 0

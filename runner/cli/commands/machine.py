@@ -1,0 +1,39 @@
+"""Commands on this machine: ``doctor``, ``completion``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from runner.cli.commands import Commands, add
+from runner.cli.completion import SHELLS
+
+
+def add_commands(commands: Commands) -> None:
+    """Adds the commands of this group."""
+    doctor = add(commands, "doctor", _doctor, "say what would keep a graph from running here, and what to type")
+    doctor.add_argument("graph", type=Path, metavar="GRAPH", nargs="?", help="also whether this graph could start")
+    doctor.add_argument(
+        "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go"
+    )
+    shell = add(commands, "completion", _completion, "print what makes a shell complete this command")
+    shell.add_argument("shell", choices=SHELLS)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from runner.cli.doctor import examine, examine_graph
+
+    findings = list(examine(options.recordings))
+    findings += examine_graph(options.graph) if options.graph else ()
+    for finding in findings:
+        print("\n".join(finding.lines()))
+    bad = sum(finding.judgement == "bad" for finding in findings)
+    print(f"{bad} of {len(findings)} must be put right" if bad else "graphs can run here")
+    return int(bad > 0)
+
+
+def _completion(options: argparse.Namespace) -> int:
+    from runner.cli.completion import script
+
+    print(script(options.shell))
+    return 0

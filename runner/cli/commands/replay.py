@@ -1,0 +1,111 @@
+"""Commands that execute a recording again: ``replay``."""
+
+import argparse
+import os
+import subprocess
+
+from runner.cli.commands import Command, Commands, add, add_file, add_settings
+from runner.contract import Refused
+
+_EPILOG = """\
+--verify                 every stage again, every message compared byte for byte
+--from, --swap, --set    what if: the changed stages and all that follows from them again, the rest as recorded
+--until, --break, --step time travel: stops at a message, prints it with its causes and opens a prompt
+none of these            says what a replay would execute
+"""
+
+
+def add_commands(commands: Commands) -> None:
+    """Adds the commands of this group."""
+    replay = add(commands, "replay", _replay, "execute the stages of a recording again from what they consumed")
+    replay.epilog, replay.formatter_class = _EPILOG, argparse.RawDescriptionHelpFormatter
+    add_file(replay)
+    add_settings(replay)
+    text = "another class for a stage, for example ranker=mine:Ranker; may be given again"
+    replay.add_argument("--swap", action="append", default=[], metavar="STAGE=MODULE:CLASS", dest="swaps", help=text)
+    text = "execute this stage and what follows from it, changed or not; may be given again"
+    replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
+    replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
+    replay.add_argument("--workers", type=_count, metavar="N", help="stages executed at the same time (one a core)")
+    _add_travel(replay)
+
+
+def _add_travel(replay: argparse.ArgumentParser) -> None:
+    replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
+    text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.weight < 0.5'"
+    replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
+    replay.add_argument(
+        "--step", action="store_true", help="go from message to message (Enter), from there or the start"
+    )
+    replay.add_argument("--prompt", action="store_true", help="open a Python prompt where it stops, terminal or not")
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
+    return int(text)
+
+
+def _replay(options: argparse.Namespace) -> int:
+    """Only saying what would be executed needs no clean process."""
+    if options.until or options.condition or options.step:
+        return _in_clean_process(options, _travel)
+    if options.swaps or options.origins or (options.settings and not options.verify):
+        return _in_clean_process(options, _what_if)
+    if options.verify:
+        return _in_clean_process(options, _verify)
+    from runner.replay.replay import plan
+
+    return plan(options.file, print)
+
+
+def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
+    """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
+    from runner.process.children import PARENT, die_with_parent
+    from runner.replay.workshop import clean_command, is_clean
+
+    if is_clean():
+        if PARENT in os.environ:
+            die_with_parent()
+        return command(options)
+    arguments, environment = clean_command("runner.cli", *options.arguments)
+    return subprocess.call(arguments, env=environment)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from runner.replay.replay import verify
+
+    return verify(options.file, options.settings, workers=options.workers, say=print)
+
+
+def _what_if(options: argparse.Namespace) -> int:
+    from runner.replay.whatif import what_if
+
+    if options.verify:
+        raise Refused("--verify compares the recording as it is; valid with --from or --swap: nothing else")
+    return what_if(
+        options.file,
+        assignments=options.settings,
+        swaps=options.swaps,
+        origins=options.origins,
+        workers=options.workers,
+        say=print,
+    )
+
+
+def _travel(options: argparse.Namespace) -> int:
+    from runner.replay.travel import travel
+
+    if options.verify:
+        raise Refused("--verify goes through the whole recording; it does not stop with --until, --break or --step")
+    if options.until and options.condition:
+        raise Refused("--until and --break each say where to stop; give one")
+    return travel(
+        options.file,
+        assignments=[*options.settings],
+        swaps=options.swaps,
+        until=options.until,
+        condition=options.condition,
+        step=options.step,
+        prompt=options.prompt,
+    )

@@ -1,0 +1,302 @@
+"""Looks for what would keep a graph from running on this machine, and says what to type."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.metadata
+import os
+import re
+import resource
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import zenoh
+
+from runner.contract import Refused
+from runner.graph.graph import load_graph
+from runner.inspect.info import byte_count
+from runner.live.tables import from_here
+from runner.message.packet import Packet, Process
+from runner.supervise.registry import registry_folder
+from runner.transport.arena import Store
+from runner.transport.bus import Bus
+from runner.transport.links import Door, Link, address_of
+from runner.transport.session import free_endpoint
+
+Judgement = Literal["good", "note", "bad"]
+LEAST_DISK = 2 * 10**9
+_SECCOMP = "allow memfd_create and abstract sockets in the container's seccomp and AppArmor profiles"
+LEAST_MEMORY = 2 * 10**9
+LEAST_FILES = 1024
+LEAST_PROCESSES = 256
+PROBE_SECONDS = 20
+_EGL_PLATFORM_SURFACELESS = 0x31DD
+_EGL_VENDOR, _EGL_VERSION = 0x3053, 0x3054
+_EGL_OPENGL_API = 0x30A2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    judgement: Judgement
+    """``good``; ``note``, with which graphs still run; ``bad``, with which they do not."""
+    subject: str
+    text: str
+    remedy: str = ""
+    """What to type."""
+
+    def lines(self) -> Iterator[str]:
+        """As it is printed."""
+        yield f"{self.judgement:<5} {self.subject:<14} {self.text}"
+        if self.remedy:
+            yield f"{'':<20} -> {self.remedy}"
+
+
+def examine(recordings: Path) -> Iterator[Finding]:
+    """Every finding, in the order of what a run needs first; a check that breaks is a finding too."""
+    checks: tuple[tuple[str, Callable[[], Iterable[Finding]]], ...] = (
+        ("python", _python),
+        ("packages", _packages),
+        ("EGL", _egl),
+        ("direct link", _direct_link),
+        ("loopback", _loopback),
+        ("zenoh", _zenoh),
+        ("runs", _runs),
+        ("recordings", lambda: _recordings(recordings)),
+        ("memory", _memory),
+        ("limits", _limits),
+    )
+    for subject, check in checks:
+        try:
+            yield from check()
+        except Exception as error:  # one that was not foreseen is worth knowing and no reason to stop
+            yield Finding("bad", subject, f"{type(error).__name__}: {error}")
+
+
+def examine_graph(path: Path) -> Iterator[Finding]:
+    """Whether a graph is well-formed and all that its stages import is here."""
+    try:
+        graph = load_graph(path)
+    except Refused as refusal:
+        for line in str(refusal).splitlines():
+            yield Finding("bad", "graph", line)
+    else:
+        yield Finding("good", "graph", f"{path}: {len(graph.nodes)} stages can be imported")
+
+
+# ------------------------------------------------------------------------------------------ versions
+
+
+def _python() -> Iterator[Finding]:
+    version = ".".join(map(str, sys.version_info[:3]))
+    yield Finding("good", "python", f"{version}, {os.cpu_count()} cores")
+
+
+def _packages() -> Iterator[Finding]:
+    """What the project needs, by its own metadata; what it was tested with, where the list lies beside it."""
+    (project, *_) = importlib.metadata.packages_distributions()["runner"]
+    needed = [
+        re.split(r"[\s;<>=!~\[(]", text)[0]
+        for text in importlib.metadata.requires(project) or ()
+        if "extra ==" not in text
+    ]
+    absent = [name for name in needed if _version(name) is None]
+    install = f"{sys.executable} -m pip install --constraint constraints.txt --editable ."
+    if absent:
+        yield Finding("bad", "packages", f"missing: {', '.join(absent)}", install)
+        return
+    tested = _tested()
+    other = [
+        f"{name} {_version(name)} instead of {tested[key]}"
+        for name in needed
+        if tested.get(key := _key(name)) not in (None, _version(name))
+    ]
+    if other:
+        yield Finding("note", "packages", f"not the tested versions: {', '.join(other)}", install)
+    else:
+        yield Finding("good", "packages", f"{len(needed)} needed, {len(needed) if tested else 'none'} known as tested")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name).partition("+")[0]
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _tested() -> dict[str, str]:
+    path = Path(__file__).parents[1] / "constraints.txt"
+    lines = path.read_text().splitlines() if path.exists() else []
+    pairs = (line.split("==") for line in lines if "==" in line and not line.startswith("#"))
+    return {_key(name): version.strip() for name, version in pairs}
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+# ------------------------------------------------------------------------------------------ rendering
+
+
+def _egl() -> Iterator[Finding]:
+    """In a process of its own: a broken driver takes its process with it."""
+    command = [sys.executable, "-c", "from runner.cli.doctor import probe_egl; print(probe_egl())"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    remedy = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or the driver of the graphics card)"
+    try:
+        found = subprocess.run(
+            command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False, env=environment
+        )
+    except subprocess.TimeoutExpired:
+        yield Finding("bad", "EGL", f"the driver hangs: no answer in {PROBE_SECONDS} s", remedy)
+        return
+    if found.returncode == 0:
+        yield Finding("good", "EGL", found.stdout.strip())
+    else:
+        reason = (found.stderr.strip().splitlines() or [f"its process ended with {found.returncode}"])[-1]
+        yield Finding("bad", "EGL", f"no picture can be rendered without a display: {reason}", remedy)
+    platform = os.environ.get("PYOPENGL_PLATFORM", "egl")
+    if platform != "egl":
+        yield Finding("note", "EGL", f"PYOPENGL_PLATFORM={platform} keeps PyOpenGL from it", "unset PYOPENGL_PLATFORM")
+
+
+def probe_egl() -> str:
+    """Opens a display without a screen and names it; raises OSError with what does not work."""
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetProcAddress.restype = egl.eglQueryString.restype = ctypes.c_void_p
+    address = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if not address:
+        raise OSError("libEGL.so.1 knows no platforms (eglGetPlatformDisplayEXT)")
+    prototype = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)
+    display = ctypes.c_void_p(prototype(address)(_EGL_PLATFORM_SURFACELESS, None, None))
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    if not display or not egl.eglInitialize(display, ctypes.byref(major), ctypes.byref(minor)):
+        raise OSError(f"no display could be opened (EGL error {egl.eglGetError():#x})")
+    if not egl.eglBindAPI(_EGL_OPENGL_API):
+        raise OSError("the driver has OpenGL ES only")
+    texts = (
+        ctypes.cast(egl.eglQueryString(display, name), ctypes.c_char_p).value for name in (_EGL_VERSION, _EGL_VENDOR)
+    )
+    version, vendor = ((text or b"").decode() for text in texts)
+    return f"{version} by {vendor}, with OpenGL and without a display"
+
+
+# ------------------------------------------------------------------------------------------ transport
+
+
+def _direct_link() -> Iterator[Finding]:
+    """A message as it goes from one process of this machine to another."""
+    sent, taken = bytes(10**6), list[Packet]()
+    address = address_of("doctor", secrets.token_hex(8), "", Process("doctor", 0))
+    try:
+        door, store = Door(address, "", taken.append, lambda _, error: None), Store()
+        link = Link(address, "", "doctor", store)
+        link.send("message", sent)
+        door.look(wait=False)
+        whole = [bytes(packet.payload) for packet in taken] == [sent]
+        taken.clear()
+        link.close()
+        door.close()
+        store.close()
+    except OSError as error:
+        yield Finding("note", "direct link", f"{error.strerror}: messages take Zenoh, which is slower", _SECCOMP)
+        return
+    yield Finding("good" if whole else "bad", "direct link", "a message of 1 MB goes through shared memory")
+
+
+def _loopback() -> Iterator[Finding]:
+    with socket.socket() as server, socket.socket() as client:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        client.settimeout(5)
+        client.connect(server.getsockname())
+        yield Finding("good", "loopback", f"127.0.0.1:{server.getsockname()[1]} takes calls")
+
+
+def _zenoh() -> Iterator[Finding]:
+    """Two sessions as two processes of a graph would have them, and a question from one to the other."""
+    version = importlib.metadata.version("eclipse-zenoh")
+    endpoint = free_endpoint()
+    try:
+        server = Bus("doctor", listen=endpoint)
+        client = Bus("doctor", connect=endpoint)
+        server.serve("echo", lambda question: question)
+        answer = client.ask("echo", b"well", 10)
+        client.close()
+        server.close()
+    except (zenoh.ZError, Refused) as error:
+        yield Finding(
+            "bad", "zenoh", f"{version}: two sessions do not meet: {error}", "see whether a firewall guards loopback"
+        )
+        return
+    yield Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet on {endpoint}")
+
+
+def _runs() -> Iterator[Finding]:
+    yield Finding("good", "runs", f"are listed in {registry_folder()}")
+
+
+# ------------------------------------------------------------------------------------------ resources
+
+
+def _recordings(folder: Path) -> Iterator[Finding]:
+    beside = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not os.access(beside, os.W_OK):
+        yield Finding("bad", "recordings", f"{beside} cannot be written", "runner up GRAPH --recordings DIR")
+        return
+    free = shutil.disk_usage(beside).free
+    judgement: Judgement = "good" if free >= LEAST_DISK else "bad"
+    remedy = "" if judgement == "good" else "remove old recordings, or runner up GRAPH --recordings DIR"
+    yield Finding(judgement, "recordings", f"{byte_count(free)} free in {from_here(str(beside))}", remedy)
+
+
+def _memory() -> Iterator[Finding]:
+    available = _meminfo()
+    limit, used = _group("memory.max"), _group("memory.current")
+    if limit is not None and used is not None:
+        available = min(available, limit - used)
+    enough = available >= LEAST_MEMORY
+    group = f", the control group allows {byte_count(limit)}" if limit is not None else ""
+    remedy = "" if enough else "end other programs, or give the container more memory"
+    yield Finding("good" if enough else "bad", "memory", f"{byte_count(available)} available{group}", remedy)
+
+
+def _meminfo() -> int:
+    lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    return int(lines["MemAvailable"].split()[0]) * 1024
+
+
+def _group(name: str) -> int | None:
+    """A limit of this process' control group (version 2), or None where there is none."""
+    try:
+        own = Path("/proc/self/cgroup").read_text().splitlines()[-1].split("::")[1].lstrip("/")
+        text = (Path("/sys/fs/cgroup") / own / name).read_text().strip()
+    except (OSError, IndexError):
+        return None
+    return int(text) if text.isdecimal() else None
+
+
+def _limits() -> Iterator[Finding]:
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    processes, _ = resource.getrlimit(resource.RLIMIT_NPROC)
+    threads = [limit for limit in (processes, _group("pids.max")) if limit not in (None, resource.RLIM_INFINITY)]
+    least = min(threads, default=None)
+    if files < LEAST_FILES:
+        yield Finding("bad", "limits", f"{files} open files, {LEAST_FILES} are needed", f"ulimit -n {LEAST_FILES}")
+    elif least is not None and least < LEAST_PROCESSES:
+        yield Finding(
+            "bad",
+            "limits",
+            f"{least} processes and threads, {LEAST_PROCESSES} are needed",
+            f"ulimit -u {LEAST_PROCESSES}",
+        )
+    else:
+        yield Finding("good", "limits", f"{files} open files, {least or 'any number of'} processes and threads")

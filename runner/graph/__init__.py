@@ -1,0 +1,1 @@
+"""A graph file: read, checked, and placed on hosts."""

@@ -1,0 +1,609 @@
+"""A graph of stages, checked: every key, setting, class and edge, before anything starts."""
+
+import importlib
+import json
+import math
+import os
+import pkgutil
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
+from runner.graph.document import Document, Keys, read_document, suggest
+from runner.graph.placement import ALONE, Layout, read_layout, read_placement
+from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
+
+T = TypeVar("T")
+K = TypeVar("K")
+MISSING = "???"
+"""Stands in a graph file where the user must give a value with ``--set``."""
+SUPERVISOR = "supervisor"
+RESERVED = (SUPERVISOR, "recorder", "viewer")
+SUPERVISOR_OUTPUTS: dict[str, type[Message]] = {port_name(Restarted): Restarted}
+FINISHED = port_name(Finished)
+RESTARTS = 3
+"""Restarts of one process before the graph ends. None for devices: what they drive has moved on meanwhile."""
+QUEUE = 64
+
+
+class EdgeEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An edge whose policy is stated."""
+
+    source: Annotated[str, Meta(description="stage.port")] = msgspec.field(name="from")
+    policy: Annotated[
+        Literal["block", "latest"],
+        Meta(description="block: nothing is lost, a full queue stops the publisher; latest: only the newest is kept"),
+    ] = "block"
+    queue: Annotated[int, Meta(ge=1, description="Unacknowledged lineages after which the publisher waits")] = QUEUE
+
+
+class StageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One stage of the graph."""
+
+    stage: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$", description="module:Class")]
+    config: Annotated[dict[str, Any], Meta(description="Settings of the stage, as its Config declares them")] = {}
+    inputs: Annotated[dict[str, str | EdgeEntry], Meta(description="Input port -> stage.port")] = {}
+    replicas: Annotated[
+        Annotated[int, Meta(ge=1)] | Literal["auto"],
+        Meta(description="Processes that share the parts; auto: one a core"),
+    ] = 1
+    restarts: Annotated[
+        Annotated[int, Meta(ge=0)] | None, Meta(description="Crashes of a process before the graph ends")
+    ] = None
+    host: Annotated[
+        str | dict[str, Annotated[int, Meta(ge=1)]] | None,
+        Meta(description="Where it runs, or how many replicas run on which host; without it on the first host"),
+    ] = None
+    heartbeat: Annotated[
+        float, Meta(gt=0, description="Seconds without a sign of life after which a process counts as hung")
+    ] = 30.0
+    timeout: Annotated[
+        float, Meta(gt=0, description="Seconds a handler may compute; time held back by consumers does not count")
+    ] = 300.0
+    startup: Annotated[float, Meta(gt=0, description="Seconds until a process must be ready")] = 180.0
+    memory: Annotated[
+        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$")] | None,
+        Meta(description="What a process may hold, for example 2GB"),
+    ] = None
+
+
+class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A graph of stages: what runs, with which settings, and what flows where."""
+
+    name: Annotated[str, Meta(pattern=r"^[\w-]+$", description="Names the recordings")]
+    stages: dict[str, StageEntry]
+    seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
+    view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
+    hosts: Annotated[
+        dict[str, str] | None, Meta(description="Machine -> ADDRESS[:PORT]; the first is the head and needs a port")
+    ] = None
+    keys: Annotated[str | None, Meta(description="Folder that `runner keys init` made; turns TLS on")] = None
+    router: Annotated[
+        str | None, Meta(description="Where all processes meet: the head's name, or ADDRESS:PORT of another router")
+    ] = None
+    score: Annotated[str | None, Meta(description="module:Class that says in numbers how well a run went")] = None
+    tolerances: Annotated[
+        str | None, Meta(description="module:NAME of the table of how far fields may be off on another machine")
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """Where an input port gets its messages from, and what happens when they come too fast."""
+
+    stage: str
+    port: str
+    policy: Literal["block", "latest"]
+    queue: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a process may do before it is taken for hung, in seconds, or for out of bounds."""
+
+    heartbeat: float = 30.0
+    """Without a pulse. Long: code that keeps the interpreter to itself is slow, not dead."""
+    timeout: float = 300.0
+    """Inside one handler. A device's source may wait for the world as long as it likes."""
+    startup: float = 180.0
+    memory: str | None = None
+    """Resident, for example ``2GB``."""
+
+    @property
+    def memory_bytes(self) -> float:
+        """The same as a number; infinite where none is set."""
+        if self.memory is None:
+            return math.inf
+        return float(self.memory[:-2]) * 1000 ** " kMGT".index(self.memory[-2])
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One stage of a checked graph."""
+
+    name: str
+    stage: str
+    """``module:Class``."""
+    type: StageType
+    config: Any
+    inputs: dict[str, Edge]
+    replicas: int
+    restarts: int
+    limits: Limits = Limits()
+    placement: tuple[str, ...] = ()
+    """The host of each replica; empty where all are on the head."""
+
+    @property
+    def replicated(self) -> bool:
+        """True where parts are shared between processes."""
+        return self.replicas > 1
+
+    def shares(self, port: str) -> bool:
+        """True where each message of this port goes to one replica only."""
+        return self.replicated and issubclass(self.type.inputs[port].type, Part)
+
+    def keeps(self, port: str) -> bool:
+        """True where a message of this port is used for several parts."""
+        return self.type.handler_of(port).keeps(self.type.inputs[port])
+
+    def kept(self, port: str) -> int:
+        """How many messages of a port parts that are under way may still need."""
+        return max(edge.queue for edge in self.inputs.values()) if self.keeps(port) else 0
+
+    def construct(self) -> Stage:
+        """A new instance with the node's settings."""
+        cls = cast("Any", self.type.cls)
+        return cls() if self.type.config is None else cls(self.config)
+
+
+class Route(msgspec.Struct, frozen=True):
+    """One edge as its publisher needs to know it."""
+
+    output: str
+    """Port of the publisher."""
+    consumer: str
+    input: str
+    """Port of the consumer."""
+    policy: Literal["block", "latest"]
+    queue: int
+    shared: bool
+    """Each message goes to one of the consumer's replicas."""
+    kept: int
+    """Messages that the consumer may use for further steps, and needs again when it restarts: as many as lineages may
+    be under way on any of its ports; 0 where it uses each once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A checked graph."""
+
+    name: str
+    seed: int
+    view: str | None
+    nodes: dict[str, Node]
+    score: str | None = None
+    tolerances: str | None = None
+    layout: Layout = ALONE
+
+    def host_of(self, stage: str, replica: int) -> str | None:
+        """The machine of a process; None where the graph names no machines."""
+        if not self.layout.hosts:
+            return None
+        placement = self.nodes[stage].placement
+        return placement[replica] if placement else self.layout.head.name
+
+    def hosts_of_stages(self) -> dict[str, set[str]]:
+        """The machines on which each stage has processes."""
+        head = {self.layout.head.name}
+        return {node.name: set(node.placement) or head for node in self.nodes.values()}
+
+    def here(self) -> "Graph":
+        """The same graph with every process on the machine that starts it."""
+        nodes = {name: replace(node, placement=()) for name, node in self.nodes.items()}
+        return replace(self, layout=ALONE, nodes=nodes)
+
+    def routes(self, stage: str) -> list[Route]:
+        """Every edge that leaves a stage."""
+        return [
+            Route(edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port))
+            for node in self.nodes.values()
+            for port, edge in node.inputs.items()
+            if edge.stage == stage
+        ]
+
+    def outputs_of(self, stage: str) -> dict[str, type[Message]]:
+        """Output ports of a stage or of the supervisor."""
+        return {**SUPERVISOR_OUTPUTS, **self.commands()} if stage == SUPERVISOR else self.nodes[stage].type.outputs
+
+    def commands(self) -> dict[str, type[Command]]:
+        """What the supervisor publishes when a command is called, by output port."""
+        return {
+            command_port(node.name, name): kind
+            for node in self.nodes.values()
+            for name, kind in node.type.commands.items()
+        }
+
+    def processes(self) -> list[tuple[str, int]]:
+        """(stage, replica) of every process."""
+        return [(node.name, replica) for node in self.nodes.values() for replica in range(node.replicas)]
+
+
+def command_port(stage: str, command: str) -> str:
+    """The supervisor's output port from which a stage gets a command."""
+    return f"{stage}_{command}"
+
+
+# ---------------------------------------------------------------------------------------------- loading
+
+
+def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
+    """Reads and checks a graph file with its ``--set`` assignments; raises Refused with one line a mistake."""
+    document = read_document(path)
+    for assignment in assignments:
+        document.set(assignment)
+    return _build(document)
+
+
+def graph_to_json(graph: Graph) -> str:
+    """The graph as it runs, every setting written out: what processes are given and recordings keep."""
+    stages = {node.name: node_entry(node) for node in graph.nodes.values()}
+    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "score", "tolerances")}
+    return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
+
+
+def node_entry(node: Node) -> dict[str, Any]:
+    """One stage as a graph file would state it, with every setting."""
+    return {
+        "stage": node.stage,
+        "config": {} if node.config is None else msgspec.to_builtins(node.config, enc_hook=str),
+        "inputs": {
+            port: {"from": f"{edge.stage}.{edge.port}", "policy": edge.policy, "queue": edge.queue}
+            for port, edge in node.inputs.items()
+            if port not in node.type.commands
+        },
+        "replicas": node.replicas,
+        **({"host": dict(Counter(node.placement))} if node.placement else {}),
+        "restarts": node.restarts,
+        "heartbeat": node.limits.heartbeat,
+        "timeout": node.limits.timeout,
+        "startup": node.limits.startup,
+        "memory": node.limits.memory,
+    }
+
+
+def node_from_entry(name: str, entry: dict[str, Any]) -> Node:
+    """Reads back what :func:`node_entry` wrote, without the rest of the graph and so without importing it."""
+    document = Document(name, Path.cwd(), {"stages": {name: _unplaced(entry)}})
+    read = _read_entry(document, name)
+    return _node(document, name, read, _load(document, name, read))
+
+
+def graph_from_json(text: str, label: str = "graph") -> Graph:
+    """Reads back what :func:`graph_to_json` wrote, for this machine alone; ``label`` names it in errors."""
+    values = {key: value for key, value in json.loads(text).items() if key not in ("hosts", "keys", "router")}
+    if isinstance(values.get("stages"), dict):
+        values["stages"] = {name: _unplaced(entry) for name, entry in values["stages"].items()}
+    return _build(Document(label, Path.cwd(), values))
+
+
+def _unplaced(entry: Any) -> Any:
+    """A stage's entry without its host: what is read back runs where it is read."""
+    return {key: value for key, value in entry.items() if key != "host"} if isinstance(entry, dict) else entry
+
+
+def _build(document: Document) -> Graph:
+    """Checks a document step by step; each step reports all of its mistakes at once."""
+    graph = _read(GraphEntry, {**document.values, "stages": {}}, document, ())
+    raw = document.values.get("stages")
+    if not isinstance(raw, dict) or not raw:
+        raise Refused(f"{document.place('stages')}: expected a mapping of stage names to stages")
+    names = list(cast("dict[str, Any]", raw))
+    entries = dict(_collect(lambda name: (name, _read_entry(document, name)), names))
+    types = dict(_collect(lambda name: (name, _load(document, name, entries[name])), names))
+    _resolve_settings(document, entries, types)
+    nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
+    layout = read_layout(document)
+    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout)
+    _collect(
+        lambda keys: _check_edge(document, checked, *keys),
+        [(node, port) for node in names for port in nodes[node].inputs],
+    )
+    return checked
+
+
+def _collect(check: Callable[[K], T], items: Iterable[K]) -> list[T]:
+    """Applies a check to every item and raises all refusals together, one line each."""
+    results: list[T] = []
+    problems: list[str] = []
+    for item in items:
+        try:
+            results.append(check(item))
+        except Refused as refusal:
+            problems.append(str(refusal))
+    if problems:
+        raise Refused("\n".join(problems))
+    return results
+
+
+def _read(kind: type[T], values: Any, document: Document, keys: Keys) -> T:
+    """Converts a mapping of the file to a struct or dataclass, naming the key that does not fit."""
+    if not isinstance(values, dict):
+        raise Refused(f"{document.place(*keys)}: expected a mapping, got {values!r}")
+    values = cast("dict[str, Any]", values)
+    known = {field.encode_name for field in msgspec.inspect.type_info(kind).fields}  # type: ignore[union-attr]
+    for key in values:
+        if key not in known:
+            raise Refused(f"{document.place(*keys, key)}: unknown key {key!r}{suggest(key, known)}")
+    try:
+        return msgspec.convert(values, kind, dec_hook=_from_yaml)
+    except Refused as refusal:
+        raise Refused(f"{document.place(*keys)}: {refusal}") from None
+    except msgspec.ValidationError as error:
+        reason, _, inner = str(error).partition(" - at `$")
+        place = document.place(*keys, *re.findall(r"\w+", inner))
+        raise Refused(f"{place}: {reason}{_choices(kind, inner)}") from None
+
+
+def _choices(kind: Any, place: str) -> str:
+    """``; valid: a, b`` where the field at ``place`` takes one of a few words."""
+    hint = get_type_hints(kind, include_extras=True).get(place.strip(".`"))
+    words = [str(word) for part in _flat(hint) if get_origin(part) is Literal for word in get_args(part)]
+    return f"; valid: {', '.join(words)}" if words else ""
+
+
+def _flat(hint: Any) -> Iterator[Any]:
+    yield hint
+    if get_origin(hint) is not Literal:
+        for argument in get_args(hint):
+            yield from _flat(argument)
+
+
+def _from_yaml(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"expected {kind.__name__}, got {value!r}")
+
+
+def _read_entry(document: Document, name: str) -> StageEntry:
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
+        raise Refused(
+            f"{document.place('stages', name)}: a stage's name is lower case letters, digits and _, "
+            f"and none of {', '.join(RESERVED)}"
+        )
+    keys = ("stages", name)
+    values = document.values["stages"][name]
+    inputs = values.get("inputs") if isinstance(values, dict) else None
+    if not isinstance(inputs, dict):
+        return _read(StageEntry, values, document, keys)
+    entry = _read(StageEntry, {**values, "inputs": {}}, document, keys)
+    edges = {port: _read_edge(document, (*keys, "inputs", port), edge) for port, edge in inputs.items()}
+    return msgspec.structs.replace(entry, inputs=edges)
+
+
+def _read_edge(document: Document, keys: Keys, value: Any) -> EdgeEntry:
+    edge = EdgeEntry(value) if isinstance(value, str) else _read(EdgeEntry, value, document, keys)
+    if edge.source.count(".") != 1:
+        raise Refused(f"{document.place(*keys)}: {edge.source!r} is not of the form stage.port")
+    return edge
+
+
+# ---------------------------------------------------------------------------------------------- classes
+
+
+def _load(document: Document, name: str, entry: StageEntry) -> StageType:
+    place = document.place("stages", name, "stage")
+    cls = load_class(entry.stage, place)
+    if not (isinstance(cls, type) and issubclass(cls, Stage)):
+        raise Refused(f"{place}: {entry.stage} is not a Stage")
+    try:
+        return inspect_stage(cls)
+    except Refused as refusal:
+        raise Refused(f"{place}: {refusal}") from None
+
+
+def load_class(reference: str, place: str) -> Any:
+    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one."""
+    module_name, _, class_name = reference.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not (module_name == error.name or module_name.startswith(f"{error.name}.")):
+            raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
+        raise Refused(
+            f"{place}: no module {module_name!r}{suggest(module_name, _modules_beside(module_name))}"
+        ) from None
+    except ImportError as error:
+        raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
+    if not hasattr(module, class_name):
+        raise Refused(
+            f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, _classes_of(module_name))}"
+        )
+    return getattr(module, class_name)
+
+
+def _modules_beside(module_name: str) -> list[str]:
+    """Names of the modules in the package that the missing one would be in."""
+    package = module_name.rpartition(".")[0]
+    try:
+        paths = importlib.import_module(package).__path__ if package else []
+    except (ImportError, AttributeError):
+        return []
+    return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
+
+
+def _classes_of(module_name: str) -> list[str]:
+    members = vars(sys.modules[module_name]).items()
+    return [name for name, value in members if isinstance(value, type) and value.__module__ == module_name]
+
+
+# ---------------------------------------------------------------------------------------------- settings
+
+
+def _resolve_settings(document: Document, entries: Mapping[str, StageEntry], types: Mapping[str, StageType]) -> None:
+    """Makes paths absolute, fills ``${stage.key}`` in and refuses what is still missing."""
+    _absolute_paths(document, entries, types)
+    settings = [(name, key) for name, entry in entries.items() for key in entry.config]
+    _collect(lambda keys: _refuse_missing(document, entries, *keys), settings)
+    _collect(lambda keys: _interpolate(document, entries, *keys), settings)
+    _absolute_paths(document, entries, types)
+
+
+def _absolute_paths(document: Document, entries: Mapping[str, StageEntry], types: Mapping[str, StageType]) -> None:
+    for name, entry in entries.items():
+        for key, value in entry.config.items():
+            if (
+                key in _path_settings(types[name].config)
+                and isinstance(value, str)
+                and "${" not in value
+                and value != MISSING
+            ):
+                entry.config[key] = str(document.folder_of("stages", name, "config", key) / Path(value).expanduser())
+
+
+def _path_settings(config: type[Any] | None) -> set[str]:
+    hints = get_type_hints(config) if config else {}
+    return {name for name, hint in hints.items() if hint is Path or Path in get_args(hint)}
+
+
+def _refuse_missing(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
+    if entries[name].config[key] == MISSING:
+        place = document.place("stages", name, "config", key)
+        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
+
+
+def _interpolate(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
+    value = entries[name].config[key]
+    if not isinstance(value, str):
+        return
+    place = document.place("stages", name, "config", key)
+
+    def replacement(match: re.Match[str]) -> str:
+        return str(_setting(entries, match.group(1), place))
+
+    whole = re.fullmatch(r"\$\{([^}]*)\}", value)
+    filled = _setting(entries, whole.group(1), place) if whole else re.sub(r"\$\{([^}]*)\}", replacement, value)
+    entries[name].config[key] = filled
+
+
+def _setting(entries: Mapping[str, StageEntry], reference: str, place: str) -> Any:
+    stage, _, key = reference.partition(".")
+    valid = [f"{name}.{key}" for name, entry in entries.items() for key in entry.config]
+    if reference not in valid:
+        raise Refused(f"{place}: no setting {reference!r} to fill in{suggest(reference, valid)}")
+    return entries[stage].config[key]
+
+
+def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> Node:
+    keys = ("stages", name)
+    if entry.config and kind.config is None:
+        raise Refused(f"{document.place(*keys, 'config')}: {entry.stage} has no settings")
+    config = _read(kind.config, entry.config, document, (*keys, "config")) if kind.config else None
+    placement = _placement(document, name, entry)
+    replicas = len(os.sched_getaffinity(0)) if entry.replicas == "auto" else max(entry.replicas, len(placement))
+    parts = [port.name for port in kind.inputs.values() if issubclass(port.type, Part) and port.kind == "one"]
+    if (entry.replicas != 1 or replicas != 1) and not parts:
+        place = document.place(*keys, "replicas" if entry.replicas != 1 else "host")
+        raise Refused(f"{place}: {entry.stage} takes no Part, which is what replicas share")
+    restarts = entry.restarts if entry.restarts is not None else 0 if kind.cls.device else RESTARTS
+    if kind.cls.stateful and replicas > 1:
+        place = document.place(*keys, "replicas")
+        raise Refused(f"{place}: {entry.stage} is stateful: replicas would remember different things; valid: 1")
+    edges = _edges(document, name, entry, kind)
+    limits = Limits(heartbeat=entry.heartbeat, timeout=entry.timeout, startup=entry.startup, memory=entry.memory)
+    return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits, placement)
+
+
+def _placement(document: Document, name: str, entry: StageEntry) -> tuple[str, ...]:
+    """The host of each replica, which a count by host or ``replicas`` says, and where both do they agree."""
+    counts = read_placement(document, name, entry.host)
+    stated = "replicas" in document.values["stages"][name]
+    if counts and stated and entry.replicas == "auto":
+        place = document.place("stages", name, "replicas")
+        raise Refused(f"{place}: the cores of {next(iter(counts))} are not known here; valid: a number")
+    if isinstance(entry.host, str):
+        return (entry.host,) * cast("int", entry.replicas)
+    placement = tuple(host for host, count in counts.items() for _ in range(count))
+    if placement and stated and entry.replicas != len(placement):
+        place = document.place("stages", name, "replicas")
+        raise Refused(f"{place}: {entry.replicas}, but host places {len(placement)}; valid: either of them alone")
+    return placement
+
+
+# ---------------------------------------------------------------------------------------------- edges
+
+
+def _edges(document: Document, name: str, entry: StageEntry, kind: StageType) -> dict[str, Edge]:
+    keys = ("stages", name, "inputs")
+    wired = [port for port in kind.inputs if port not in kind.commands]
+    for port in entry.inputs:
+        if port not in kind.inputs:
+            raise Refused(f"{document.place(*keys, port)}: {entry.stage} has no input {port!r}{suggest(port, wired)}")
+        if port in kind.commands:
+            raise Refused(f"{document.place(*keys, port)}: a command is not connected: runner call {name} {port}")
+    missing = [port for port in wired if port not in entry.inputs]
+    if missing:
+        wanted = ", ".join(f"{port} ({kind.inputs[port].type.__name__})" for port in missing)
+        raise Refused(f"{document.place(*keys)}: not connected: {wanted}")
+    edges = {port: _edge(cast("EdgeEntry", edge)) for port, edge in entry.inputs.items()}
+    commands = {port: Edge(SUPERVISOR, command_port(name, port), "block", QUEUE) for port in kind.commands}
+    return {**edges, **commands}
+
+
+def _edge(entry: EdgeEntry) -> Edge:
+    stage, port = entry.source.split(".")
+    return Edge(stage, port, entry.policy, entry.queue)
+
+
+def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
+    """Refuses an edge from nowhere and one whose ends differ in type."""
+    place = document.place("stages", name, "inputs", port)
+    edge, wanted = graph.nodes[name].inputs[port], graph.nodes[name].type.inputs[port]
+    if edge.stage != SUPERVISOR and edge.stage not in graph.nodes:
+        raise Refused(f"{place}: no stage {edge.stage!r}{suggest(edge.stage, graph.nodes)}")
+    outputs = graph.outputs_of(edge.stage)
+    given = outputs.get(edge.port)
+    if given is None:
+        raise Refused(f"{place}: {edge.stage} has no output {edge.port!r}{suggest(edge.port, outputs)}")
+    if given is not wanted.type:
+        fitting = ", ".join(_fitting_outputs(graph, wanted)) or "none in this graph"
+        raise Refused(
+            f"{place}: expected {wanted.type.__name__}, but {edge.stage}.{edge.port} is {given.__name__}; "
+            f"valid: {fitting}"
+        )
+
+
+def _fitting_outputs(graph: Graph, wanted: InputPort) -> Iterator[str]:
+    for node in graph.nodes.values():
+        for port, kind in node.type.outputs.items():
+            if kind is wanted.type:
+                yield f"{node.name}.{port}"
+
+
+# ---------------------------------------------------------------------------------------------- published forms
+
+
+def mermaid(graph: Graph) -> str:
+    """The graph as a Mermaid flow chart with message types on its edges."""
+    lines = ["flowchart LR"]
+    for node in graph.nodes.values():
+        label = f"{node.name}<br/>x {node.replicas}" if node.replicated else node.name
+        lines.append(f'  {node.name}[["{label}"]]' if node.type.cls.device else f'  {node.name}["{label}"]')
+    for node in graph.nodes.values():
+        for port, edge in node.inputs.items():
+            style = "-.->" if edge.policy == "latest" else "-->"
+            lines.append(f'  {edge.stage} {style}|"{node.type.inputs[port].type.__name__}"| {node.name}')
+    return "\n".join(lines)
+
+
+def graph_schema() -> dict[str, Any]:
+    """JSON Schema of graph files, for editors."""
+    schema = msgspec.json.schema(GraphEntry)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Graph of stages", **schema}

@@ -1,0 +1,417 @@
+"""The head's side of a graph on several machines: who has joined, what they run, and who is cut off.
+
+Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learns when it joins:
+
+==========================  ======================================================================================
+``q/join``                  a host's question (:class:`Hello`), answered with :class:`Welcome` or the reason why not
+``q/past``                  the recording so far, from an offset on: what a stateful stage lived before a restart
+``order/HOST/SESSION``      what the host is to do (:data:`Order`); only the head may publish here
+``report/HOST/SESSION``     what has come of it (:data:`Report`)
+``present/HOST/0/SESSION``  liveliness of the host, of the head too; a host without it is cut off
+==========================  ======================================================================================
+"""
+
+from __future__ import annotations
+
+import secrets
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from runner.contract import Level, Refused
+from runner.graph.document import Document, read_document, suggest
+from runner.graph.placement import Layout, Network
+from runner.hosts.keys import credentials
+from runner.message.packet import Packet, Process
+from runner.process.stage_process import Assignment
+from runner.recording.provenance import fingerprint, machine, package_versions, revision
+from runner.transport.bus import Bus
+from runner.transport.session import Router, free_endpoint
+
+ABSENT_SECONDS = 60.0
+"""How long a host that is cut off may stay away while a stage has no other process."""
+REMIND_SECONDS = 30.0
+JOIN_SECONDS = 5.0
+LEAVE_SECONDS = 3.0
+CUT_OFF = 1
+"""Stands for the exit code of a process that nobody hears of any more."""
+SHOWN_DIFFERENCES = 5
+PIECE_BYTES = 4 * 2**20
+"""Of a recording that a host reads, at a time."""
+_MISSING = "nothing"
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """What a host says of itself to take part."""
+
+    host: str
+    session: int
+    """Another one each time it is started."""
+    graph: str
+    """JSON of its graph file, as it is written."""
+    folder: str
+    """Where that file lies."""
+    cwd: str
+    fingerprint: str
+    revision: str
+
+
+class Welcome(msgspec.Struct, frozen=True):
+    """What a host is told when it takes part."""
+
+    run: str
+
+
+class Start(msgspec.Struct, frozen=True, tag=True):
+    """A process to start."""
+
+    process: Process
+    task: Assignment
+
+
+class Signal(msgspec.Struct, frozen=True, tag=True):
+    """A signal to a process, or to it and all that it has started."""
+
+    process: Process
+    signum: int
+    group: bool
+
+
+class Dismiss(msgspec.Struct, frozen=True, tag=True):
+    """The end: all processes are ended, and the host with them."""
+
+    code: int
+    reason: str
+
+
+class Started(msgspec.Struct, frozen=True, tag=True):
+    """A process is there."""
+
+    process: Process
+    pid: int
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
+    """A process has gone."""
+
+    process: Process
+    code: int
+    output: str
+    """The last that it printed."""
+
+
+Order = Start | Signal | Dismiss
+Report = Started | Ended
+
+
+def control(graph: str) -> str:
+    """Below which head and hosts of a graph talk."""
+    return f"hosts/{graph}"
+
+
+class RemoteChild:
+    """A process on another host, as the supervisor sees it: like the :class:`subprocess.Popen` of one that is here."""
+
+    def __init__(self, process: Process, log: Path, send: Callable[[Order], None]):
+        self.process = process
+        self.pid = 0
+        """On its own host; 0 until it is there."""
+        self.returncode: int | None = None
+        self._log = log
+        self._send = send
+        self._ended = threading.Event()
+        log.touch()
+
+    def poll(self) -> int | None:
+        """Its exit code, None while it lives."""
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Waits for its end; raises subprocess.TimeoutExpired."""
+        if not self._ended.wait(timeout):
+            raise subprocess.TimeoutExpired(self.process.path, timeout or 0.0)
+        return self.returncode or 0
+
+    def send_signal(self, signum: int) -> None:
+        """Signals this process alone."""
+        self._signal(signum, group=False)
+
+    def signal_group(self, signum: int) -> None:
+        """Signals it and everything it has started."""
+        self._signal(signum, group=True)
+
+    def end(self, code: int, output: str) -> None:
+        """Takes note that it has gone; its last words are kept where those of other processes are."""
+        if self.returncode is None:
+            with self._log.open("a") as log:
+                log.write(output)
+            self.returncode = code
+            self._ended.set()
+
+    def _signal(self, signum: int, *, group: bool) -> None:
+        if self.returncode is None:
+            self._send(Signal(self.process, signum, group))
+
+
+@dataclass(slots=True)
+class _Place:
+    """One host as the head sees it."""
+
+    name: str
+    hello: Hello | None = None
+    """Of the session that takes part now."""
+    lost_at: float | None = None
+    children: dict[Process, RemoteChild] = field(default_factory=dict[Process, RemoteChild])
+    waiting: list[Start] = field(default_factory=list[Start])
+    """What it is to start once it is there."""
+
+
+class Hosts:
+    """The other machines of a run. Its methods may be called from any thread."""
+
+    def __init__(self, name: str, file: Path, layout: Layout, say: Callable[[str, Level], None]):
+        """Opens the place where all meet; ``name`` and ``file`` are the graph's. Raises Refused where it is taken."""
+        self.network = network = network_of(layout, layout.head.name)
+        self.endpoint = layout.endpoint
+        self._document = read_document(file)
+        self._say = say
+        self._run = ""
+        self._closing = False
+        self._places = {host: _Place(host) for host in layout.names[1:]}
+        self._present: set[Process] = set()
+        self._changed = threading.Condition(threading.RLock())
+        self._remind_at = time.monotonic()
+        self._router = Router(self.endpoint, network) if layout.router_is_head else None
+        listen = None if network.routed else self.endpoint
+        self._bus = Bus(
+            control(name),
+            listen=listen,
+            connect=None if listen else self.endpoint,
+            network=network,
+            process=Process(network.head, 0, secrets.randbits(24)),
+        )
+
+    def listen(self) -> str | None:
+        """An endpoint for the head's own session of the run; None where it meets the others at a router."""
+        return None if self.network.routed else free_endpoint(self.network.listen)
+
+    def open(self, run: str, recording: Path) -> None:
+        """Lets hosts join a run, and read what has been recorded of it."""
+        self._run = run
+        self._bus.serve("past", lambda offset: _read(recording, int(offset)))
+        self._bus.subscribe("report/*/*", self._on_report)
+        self._bus.watch(self._on_presence)
+        self._bus.serve("join", lambda text: msgspec.json.encode(self._join(msgspec.json.decode(text, type=Hello))))
+        self._bus.announce()
+
+    def start(self, host: str, process: Process, task: Assignment, log: Path) -> RemoteChild:
+        """Has a process started, as soon as its host is there."""
+        child = RemoteChild(process, log, lambda order: self._order(place, order))
+        with self._changed:
+            place = self._places[host]
+            place.children[process] = child
+            self._order(place, Start(process, task))
+        return child
+
+    def waits(self, process: Process) -> bool:
+        """Whether a process has not been started yet, because its host is not there."""
+        with self._changed:
+            return any(start.process == process for place in self._places.values() for start in place.waiting)
+
+    def remind(self) -> None:
+        """Says from time to time which hosts are still waited for."""
+        missing = [place.name for place in self._places.values() if place.hello is None and place.waiting]
+        if missing and time.monotonic() > self._remind_at:
+            self._remind_at = time.monotonic() + REMIND_SECONDS
+            for name in missing:
+                self._say(f"waiting for host {name}: runner up {self._document.label} --host {name}", "info")
+
+    def overdue(self, host_of: Mapping[str, set[str]]) -> str | None:
+        """Why the graph cannot go on without a host that stays away; ``host_of`` has the hosts of each stage."""
+        for place in self._places.values():
+            if place.lost_at is None or time.monotonic() < place.lost_at + ABSENT_SECONDS:
+                continue
+            away = {other.name for other in self._places.values() if other.hello is None}
+            stranded = [stage for stage, hosts in host_of.items() if place.name in hosts and hosts <= away]
+            if stranded:
+                stages = ", ".join(stranded)
+                return f"host {place.name} has been cut off for {ABSENT_SECONDS:g} s, and {stages} runs nowhere else"
+        return None
+
+    def close(self, code: int, reason: str) -> None:
+        """Sends every host home and closes the place where all meet."""
+        self._closing = True
+        for place in self._places.values():
+            self._order(place, Dismiss(code, reason))
+        with self._changed:
+            self._changed.wait_for(self._all_gone, LEAVE_SECONDS)
+        self._bus.close()
+        if self._router is not None:
+            self._router.close()
+
+    # ------------------------------------------------------------------------------------------ what is heard
+
+    def _join(self, hello: Hello) -> Welcome:
+        """Takes a host in, or raises Refused with the reason."""
+        place = self._places.get(hello.host)
+        if place is None:
+            raise Refused(f"host {hello.host!r}: the head starts that itself{suggest(hello.host, self._places)}")
+        self._refuse_other_graph(hello)
+        own = Process(hello.host, 0, hello.session)
+        with self._changed:
+            if not self._changed.wait_for(lambda: own in self._present, JOIN_SECONDS):
+                raise Refused(f"host {hello.host} was not seen for {JOIN_SECONDS:g} s; start it again")
+            if place.hello is not None:
+                raise Refused(f"host {hello.host} takes part already; valid: one `runner up` a host")
+            back = place.lost_at is not None
+            place.hello, place.lost_at = hello, None
+            waiting, place.waiting = place.waiting, []
+            for start in waiting:
+                self._order(place, start)
+        self._say(f"host {hello.host} is {'back' if back else 'there'}", "info")
+        self._compare_machines(hello)
+        return Welcome(self._run)
+
+    def _on_presence(self, process: Process, present: bool) -> None:
+        place = self._places.get(process.stage)
+        if place is None:
+            return
+        with self._changed:
+            (self._present.add if present else self._present.discard)(process)
+            self._changed.notify_all()
+            if (
+                place.hello is not None
+                and place.hello.session == process.incarnation
+                and not (present or self._closing)
+            ):
+                self._lose(place)
+
+    def _on_report(self, packet: Packet) -> None:
+        _, host, session = packet.key.split("/")
+        place = self._places.get(host)
+        with self._changed:
+            if place is None or place.hello is None or str(place.hello.session) != session:
+                return
+            match msgspec.json.decode(packet.payload, type=Report):
+                case Started(process, pid) if process in place.children:
+                    place.children[process].pid = pid
+                case Ended(process, code, output) if process in place.children:
+                    place.children.pop(process).end(code, output)
+                case _:
+                    pass
+
+    def _lose(self, place: _Place) -> None:
+        """Counts everything on a host as gone; what cannot be started elsewhere is started when it is back."""
+        place.hello, place.lost_at = None, time.monotonic()
+        children, place.children = place.children, {}
+        self._say(f"host {place.name} is cut off, with {len(children)} processes", "warning")
+        for child in children.values():
+            child.end(CUT_OFF, f"host {place.name} is cut off\n")
+
+    # ------------------------------------------------------------------------------------------ what is said
+
+    def _order(self, place: _Place, order: Order) -> None:
+        """Sends an order; one to start a process waits for its host, and is withdrawn by a signal."""
+        with self._changed:
+            hello = place.hello
+            if hello is not None:
+                if isinstance(order, Start):
+                    order = Start(order.process, self._moved(order.task, hello))
+                self._bus.publish(f"order/{place.name}/{hello.session}", msgspec.json.encode(order))
+            elif isinstance(order, Start):
+                place.waiting.append(order)
+            elif isinstance(order, Signal):
+                self._cancel(place, order.process)
+
+    def _cancel(self, place: _Place, process: Process) -> None:
+        place.waiting = [start for start in place.waiting if start.process != process]
+        child = place.children.pop(process, None)
+        if child is not None:
+            child.end(0, "")
+
+    def _moved(self, task: Assignment, hello: Hello) -> Assignment:
+        """Paths below the folders of the head become paths below those of the host."""
+        folders = {str(self._document.folder): hello.folder, str(Path.cwd()): hello.cwd}
+        return msgspec.structs.replace(task, entry=moved(task.entry, folders))
+
+    def _refuse_other_graph(self, hello: Hello) -> None:
+        """All hosts must mean the same graph; settings are the head's alone and reach them with their tasks."""
+        theirs, own = msgspec.json.decode(hello.graph), msgspec.json.decode(as_written(self._document))
+        found = list(differences(own, theirs))
+        if found:
+            shown = [f"{key}: {there} at {hello.host}, {here} at the head" for key, here, there in found]
+            more = f" and {len(found) - SHOWN_DIFFERENCES} more" if len(found) > SHOWN_DIFFERENCES else ""
+            raise Refused(
+                f"host {hello.host} has another graph: {'; '.join(shown[:SHOWN_DIFFERENCES])}{more}; "
+                f"copy the head's file to it"
+            )
+
+    def _compare_machines(self, hello: Hello) -> None:
+        """Says where results may depend on which host computed them."""
+        if hello.revision != (own := revision()):
+            self._say(f"host {hello.host} runs source {hello.revision[:12]}, the head {own[:12]}", "warning")
+        if hello.fingerprint != this_machine():
+            self._say(
+                f"host {hello.host} has another processor or other libraries: floats may differ in their last bits",
+                "warning",
+            )
+
+    def _all_gone(self) -> bool:
+        return not self._present
+
+
+def this_machine() -> str:
+    """Hash over what floats depend on here."""
+    return fingerprint(machine(), package_versions())
+
+
+def as_written(document: Document) -> str:
+    """JSON of a graph file without the changes of the command line."""
+    return msgspec.json.encode(read_document(Path(document.label)).values, enc_hook=str).decode()
+
+
+def differences(own: Any, theirs: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """(key, own value, their value) of everything that differs between two trees."""
+    if isinstance(own, dict) and isinstance(theirs, dict):
+        mine, other = cast("dict[str, Any]", own), cast("dict[str, Any]", theirs)
+        for name in {**mine, **other}:
+            inner = f"{key}.{name}" if key else name
+            yield from differences(mine.get(name, _MISSING), other.get(name, _MISSING), inner)
+    elif own != theirs:
+        yield key, _short(own), _short(theirs)
+
+
+def moved(value: Any, folders: Mapping[str, str]) -> Any:
+    """A copy of a tree in which paths below one folder are below another."""
+    match value:
+        case str():
+            start = next((old for old in folders if value.startswith(f"{old}/")), None)
+            return value if start is None else folders[start] + value[len(start) :]
+        case dict():
+            return {key: moved(inner, folders) for key, inner in cast("dict[str, Any]", value).items()}
+        case list():
+            return [moved(inner, folders) for inner in cast("list[Any]", value)]
+        case _:
+            return value
+
+
+def _read(file: Path, offset: int) -> bytes:
+    with file.open("rb") as opened:
+        opened.seek(offset)
+        return opened.read(PIECE_BYTES)
+
+
+def _short(value: Any) -> str:
+    text = value if value is _MISSING else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def network_of(layout: Layout, host: str) -> Network:
+    """What the sessions of one host are told; raises Refused where its credentials do not hold."""
+    return layout.network(host, None if layout.keys is None else credentials(layout.keys, host))

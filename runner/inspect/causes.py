@@ -1,0 +1,115 @@
+"""Why a message exists: the tree of its causes back to the look it hangs on, with what each hop cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+from runner.contract import Refused
+from runner.graph.document import suggest
+from runner.inspect.info import seconds
+from runner.message.codec import Step
+from runner.recording.recording import Recording, topic_of
+
+
+class Causes:
+    """Which step emitted each message of a recording, and what that step had consumed."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._steps = {id: step for step in recording.steps for id in step.emitted}
+
+    def step_of(self, id: str) -> Step | None:
+        """The step that emitted a message; None where it is not journalled."""
+        return self._steps.get(id)
+
+    def inputs_of(self, id: str) -> list[tuple[str, str]]:
+        """(port, id) of what led to a message; from its header, without ports, where its step is not journalled."""
+        step = self._steps.get(id)
+        if step is not None:
+            return list(step.consumed)
+        recorded = id in self._recording.messages
+        return [("", cause) for cause in self._recording.envelope(id).causes] if recorded else []
+
+    def last_input(self, id: str) -> str | None:
+        """What the step that emitted a message had waited for: the input that was recorded last."""
+        arrived = self._arrival_times
+        return max((cause for _, cause in self.inputs_of(id)), key=lambda cause: arrived.get(cause, 0), default=None)
+
+    @cached_property
+    def _arrival_times(self) -> dict[str, int]:
+        return {id: message.log_time_ns for id, message in self._recording.messages.items()}
+
+
+def why(path: Path, id: str) -> list[str]:
+    """The tree of causes of one message as lines; raises Refused where nothing in the recording speaks of it."""
+    return tree(Recording(path), id)
+
+
+def tree(recording: Recording, id: str) -> list[str]:
+    """The tree of causes as lines: each message with the queueing, transport and computing of its step.
+
+    It ends where the message's lineage starts, which for what is perceived is the look. What leads to a message twice
+    is shown once.
+    """
+    causes = Causes(recording)
+    if id not in recording.messages and causes.step_of(id) is None:
+        raise Refused(f"{recording.path}: no message {id!r}{suggest(id, recording.messages)}")
+    root = recording.messages[id].lineage if id in recording.messages else ""
+    return list(_lines(recording, causes, id, root))
+
+
+def newest(folder: Path) -> Path:
+    """The newest recording of a folder; raises Refused where there is none."""
+    found = max(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
+    if found is None:
+        raise Refused(f"{folder}: no recording here; valid: runner why ID FILE")
+    return found
+
+
+def _lines(recording: Recording, causes: Causes, id: str, root: str) -> Iterator[str]:
+    """Depth first with a stack of its own: chains of causes may be longer than Python's."""
+    seen: set[str] = set()
+    stack = [("", "", "", id)]
+    while stack:
+        lead, branch, port, current = stack.pop()
+        repeated = current in seen
+        seen.add(current)
+        note = ", as above" if repeated else _cost(recording, causes, current, root)
+        yield f"{lead}{branch}{f'{port}: ' if port else ''}{current}{note}"
+        if repeated or current == root:
+            continue
+        below = lead + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch]
+        inputs = causes.inputs_of(current)
+        branches = ["├─ "] * (len(inputs) - 1) + ["└─ "]
+        children = [(below, mark, port, cause) for mark, (port, cause) in zip(branches, inputs, strict=False)]
+        stack.extend(reversed(children))
+
+
+def _cost(recording: Recording, causes: Causes, id: str, root: str) -> str:
+    step = causes.step_of(id)
+    kind = f"  {recording.messages[id].type}" if id in recording.messages else "  MISSING from the recording"
+    start = ", the lineage starts here" if id == root else ""
+    if step is None:
+        return f"{kind}{start}"
+    if not step.consumed:
+        return f"{kind}, computed {seconds(step.computed_ns)}{start or ', a start'}"
+    replica = f" by replica {step.replica}" if step.replica else ""
+    hop = f"travelled {seconds(step.travelled_ns)}, queued {seconds(step.waited_ns)}"
+    return f"{kind}, {hop}, computed {seconds(step.computed_ns)}{replica}{start}"
+
+
+def path_to(recording: Recording, causes: Causes, id: str) -> list[str]:
+    """The critical path from the start of a message's lineage to it: at each step the input that came last."""
+    root = recording.messages[id].lineage if id in recording.messages else ""
+    path = [id]
+    while path[-1] != root and (cause := causes.last_input(path[-1])) is not None and cause not in path:
+        path.append(cause)
+    return path[::-1]
+
+
+def edge_of(cause: str, step: Step) -> str:
+    """``publisher/port -> consumer.port`` of one message that a step consumed."""
+    port = next((port for port, id in step.consumed if id == cause), "")
+    return f"{topic_of(cause)} -> {step.stage}.{port}"

@@ -1,0 +1,139 @@
+"""Describes a recording in readable tables: what ran, what was said, how long each step took, what is missing."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from runner.contract import Restarted
+from runner.graph.graph import SUPERVISOR
+from runner.graph.ports import port_name
+from runner.message.codec import Step
+from runner.recording.provenance import NUMERICAL
+from runner.recording.recording import Located, Recording
+
+Cells = Sequence[str]
+RESTARTED = f"{SUPERVISOR}/{port_name(Restarted)}"
+
+
+def describe(path: Path) -> str:
+    """The whole description; raises Refused with one line where the file is no recording."""
+    recording = Recording(path)
+    blocks = (_origin(recording), _topics(recording), stage_times(recording.steps), _complaints(recording))
+    return "\n\n".join("\n".join(block) for block in map(list, blocks) if block)
+
+
+def _origin(recording: Recording) -> Iterator[str]:
+    run, machine = recording.run, recording.aspect("machine", dict[str, str]())
+    settings = recording.aspect("settings", list[str]())
+    yield f"{recording.path}: {recording.verdict}"
+    yield f"graph     {run.get('name')} (seed {run.get('seed')}{''.join(f', --set {text}' for text in settings)})"
+    yield f"started   {run.get('started')}, lasted {seconds(_duration_ns(recording))}"
+    size = byte_count(recording.path.stat().st_size)
+    yield f"size      {size}, {len(recording.messages)} messages, {_restarts(recording)}"
+    yield f"revision  {run.get('revision') or 'unknown'}"
+    yield f"machine   {machine.get('processor')}, Python {machine.get('python')}, {machine.get('blas')}"
+    yield f"computes  fingerprint {recording.fingerprint}: {_packages(recording)}"
+    for path, found in recording.aspect("files", dict[str, str]()).items():
+        yield f"file      {path} {found[:16] if len(found) == 64 else found}"
+
+
+def _packages(recording: Recording) -> str:
+    packages = recording.aspect("packages", dict[str, str]())
+    shown = ", ".join(f"{name} {packages[name]}" for name in NUMERICAL if name in packages)
+    return f"{shown or 'no package'} of {len(packages)} packages"
+
+
+def _topics(recording: Recording) -> list[str]:
+    by_topic: dict[str, list[Located]] = defaultdict(list)
+    for message in recording.messages.values():
+        by_topic[message.topic].append(message)
+    rows = [_topic_row(topic, messages) for topic, messages in sorted(by_topic.items())]
+    return table(("topic", "type", "count", "bytes", "per second"), rows)
+
+
+def _topic_row(topic: str, messages: list[Located]) -> Cells:
+    times = [message.log_time_ns for message in messages]
+    span = (max(times) - min(times)) * 1e-9
+    rate = f"{(len(messages) - 1) / span:.2f}" if span > 0 else "-"
+    return topic, messages[0].type, str(len(messages)), byte_count(sum(message.size for message in messages)), rate
+
+
+def stage_times(steps: Iterable[Step]) -> list[str]:
+    """A table of how long every stage computed and waited, one row per stage."""
+    by_stage: dict[str, list[Step]] = defaultdict(list)
+    for step in steps:
+        by_stage[step.stage].append(step)
+    rows = [_stage_row(stage, steps) for stage, steps in sorted(by_stage.items())]
+    titles = ("stage", "processes", "steps", "compute p50", "max", "total", "travel p50", "wait p50", "ended badly")
+    return table(titles, rows)
+
+
+def _stage_row(stage: str, steps: list[Step]) -> Cells:
+    computed = [step.computed_ns for step in steps]
+    return (
+        stage,
+        str(len({(step.replica, step.incarnation) for step in steps})),
+        str(len(steps)),
+        seconds(float(np.median(computed))),
+        seconds(max(computed)),
+        seconds(sum(computed)),
+        seconds(float(np.median([step.travelled_ns for step in steps]))),
+        seconds(float(np.median([step.waited_ns for step in steps]))),
+        str(sum(step.outcome != "done" for step in steps) or "-"),
+    )
+
+
+def _complaints(recording: Recording) -> Iterator[str]:
+    yield from (f"damage at {damage}" for damage in recording.damage)
+    yield from (f"missing {id}" for id in recording.verdict.missing)
+    repeated = sum(count > 0 for count in recording.repeated.values())
+    if repeated:
+        yield f"{repeated} messages were sent again after a restart"
+    for line in recording.log:
+        if line.level in ("warning", "error"):
+            yield f"{line.level} of {line.stage}[{line.replica}]: {line.text}"
+
+
+def _restarts(recording: Recording) -> str:
+    count = sum(message.topic == RESTARTED for message in recording.messages.values())
+    return f"{count} restart{'' if count == 1 else 's'}"
+
+
+def _duration_ns(recording: Recording) -> int:
+    times = [message.log_time_ns for message in recording.messages.values()]
+    return max(times) - min(times) if times else 0
+
+
+def table(titles: Cells, rows: Iterable[Cells]) -> list[str]:
+    """Aligned lines under their titles, the first two columns to the left; nothing without rows."""
+    rows = list(rows)
+    if not rows:
+        return []
+    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
+    return ["  ".join(_aligned(row, widths)).rstrip() for row in (titles, *rows)]
+
+
+def _aligned(row: Cells, widths: Sequence[int]) -> Iterator[str]:
+    for column, (cell, width) in enumerate(zip(row, widths, strict=True)):
+        yield cell.ljust(width) if column == 0 or not (cell[:1].isdigit() or cell == "-") else cell.rjust(width)
+
+
+def seconds(nanoseconds: float) -> str:
+    """A duration for people to read."""
+    seconds = nanoseconds * 1e-9
+    if seconds >= 60:
+        return f"{seconds // 60:.0f} min {seconds % 60:.0f} s"
+    return f"{seconds:.2f} s" if seconds >= 1 else f"{seconds * 1e3:.2f} ms"
+
+
+def byte_count(count: float) -> str:
+    """Bytes for people to read."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.4g} {unit}"
+        count /= 1000
+    return f"{count:.4g} GB"

@@ -1,0 +1,144 @@
+"""How long messages travel, queue and are worked on: by edge, by stage, and along the critical path of every look."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from runner.inspect.causes import Causes, edge_of, path_to
+from runner.inspect.info import Cells, seconds, table
+from runner.message.codec import Step
+from runner.recording.recording import Recording
+
+PATHS = 20
+"""Critical paths that are shown, the longest first."""
+HOPS = 6
+"""Hops of a path that are named, the costliest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hop:
+    """One step on a critical path."""
+
+    stage: str
+    travelled_ns: int
+    queued_ns: int
+    computed_ns: int
+
+    @property
+    def total_ns(self) -> int:
+        """From the publication of what was waited for to the end of the step."""
+        return self.travelled_ns + self.queued_ns + self.computed_ns
+
+
+@dataclass(frozen=True, slots=True)
+class CriticalPath:
+    """What the last message of a lineage had to wait for, one step after the other."""
+
+    lineage: str
+    last: str
+    elapsed_ns: int
+    """From the first message to the last, as the recorder received them."""
+    hops: tuple[Hop, ...]
+
+
+def latency(path: Path) -> list[str]:
+    """The whole report; raises Refused where the file is no recording."""
+    recording = Recording(path)
+    causes = Causes(recording)
+    paths = critical_paths(recording, causes)
+    blocks = (
+        [f"{path}: {recording.verdict}"],
+        _edges(recording, causes),
+        _stages(recording.steps),
+        _path_table(paths),
+        [_path_line(found) for found in paths[:PATHS]],
+    )
+    return [line for block in blocks if block for line in (*block, "")][:-1]
+
+
+def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
+    """One per lineage that a step followed on, the longest first."""
+    lineages: dict[str, list[str]] = defaultdict(list)
+    for message in recording.messages.values():
+        lineages[message.lineage].append(message.id)
+    paths = [_critical_path(recording, causes, lineage, ids) for lineage, ids in lineages.items()]
+    return sorted((path for path in paths if path.hops), key=lambda path: -path.elapsed_ns)
+
+
+def _critical_path(recording: Recording, causes: Causes, lineage: str, ids: Sequence[str]) -> CriticalPath:
+    received = {id: recording.messages[id].log_time_ns for id in ids}
+    last = max(ids, key=lambda id: received[id])
+    steps = [causes.step_of(id) for id in path_to(recording, causes, last)[1:]]
+    hops = tuple(
+        Hop(step.stage, step.travelled_ns, step.waited_ns, step.computed_ns) for step in steps if step is not None
+    )
+    return CriticalPath(lineage, last, received[last] - min(received.values()), hops)
+
+
+# ------------------------------------------------------------------------------------ tables
+
+
+def _edges(recording: Recording, causes: Causes) -> list[str]:
+    """A step's waiting is its last input's: what waits for a partner at a join is not late."""
+    travelled: dict[str, list[int]] = defaultdict(list)
+    queued: dict[str, list[int]] = defaultdict(list)
+    for step in recording.steps:
+        last = _last_input(recording, step)
+        if last is not None:
+            edge = edge_of(last, step)
+            travelled[edge].append(step.travelled_ns)
+            queued[edge].append(step.waited_ns)
+    rows = ((edge, str(len(travelled[edge])), *_spread(travelled[edge]), *_spread(queued[edge])) for edge in travelled)
+    return table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), sorted(rows))
+
+
+def _last_input(recording: Recording, step: Step) -> str | None:
+    known = [id for _, id in step.consumed if id in recording.messages]
+    return max(known, key=lambda id: recording.messages[id].log_time_ns, default=None)
+
+
+def _stages(steps: Iterable[Step]) -> list[str]:
+    computed: dict[str, list[int]] = defaultdict(list)
+    for step in steps:
+        computed[f"{step.stage}.{step.handler}"].append(step.computed_ns)
+    rows = ((name, str(len(times)), *_spread(times), seconds(sum(times))) for name, times in computed.items())
+    return table(("handler", "count", "compute p50", "p99", "total"), sorted(rows))
+
+
+def _spread(times: Sequence[int]) -> Cells:
+    return [seconds(float(value)) for value in np.percentile(times, (50, 99))]
+
+
+def _path_table(paths: Sequence[CriticalPath]) -> list[str]:
+    rows = [_path_row(path) for path in paths[:PATHS]]
+    return table(("critical path of", "hops", "elapsed", "travel", "queue", "compute", "up to"), rows)
+
+
+def _path_row(path: CriticalPath) -> Cells:
+    sums = (
+        sum(hop.travelled_ns for hop in path.hops),
+        sum(hop.queued_ns for hop in path.hops),
+        sum(hop.computed_ns for hop in path.hops),
+    )
+    return path.lineage, str(len(path.hops)), seconds(path.elapsed_ns), *map(seconds, sums), path.last
+
+
+def _path_line(path: CriticalPath) -> str:
+    """The costliest hops in the order of the path; further visits of a stage are added to its first."""
+    by_stage: dict[str, int] = defaultdict(int)
+    for hop in path.hops:
+        by_stage[hop.stage] += hop.total_ns
+    costly = set(sorted(by_stage, key=lambda stage: -by_stage[stage])[:HOPS])
+    return f"{path.lineage}: " + ", ".join(_named(by_stage, costly))
+
+
+def _named(by_stage: dict[str, int], costly: set[str]) -> Iterator[str]:
+    yield from (f"{stage} {seconds(total)}" for stage, total in by_stage.items() if stage in costly)
+    rest = sum(total for stage, total in by_stage.items() if stage not in costly)
+    if rest:
+        yield f"others {seconds(rest)}"

@@ -1,0 +1,40 @@
+"""What a run has said: the log lines of its recording, also while it is being written, and what processes printed."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from mcap.records import Metadata
+
+from runner.contract import Refused
+from runner.message.codec import CodecError, LogLine, unpack
+from runner.recording.container import Container, Growing, open_file
+from runner.recording.recording import LOG
+
+
+def log_lines(path: Path, *, follow: bool) -> Iterator[LogLine]:
+    """Every line in the order of recording; with ``follow`` goes on until the graph has ended."""
+    with open_file(path) as file:
+        source: IO[bytes] | Growing = Growing(file) if follow else file
+        for record in Container(source, str(path)):
+            if not isinstance(record, Metadata) and record.topic.startswith(LOG):
+                with contextlib.suppress(CodecError):
+                    yield unpack(LogLine, record.data)
+
+
+def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:
+    """(process, line) of what the processes of a stage wrote to their output: tracebacks, warnings."""
+    for path in sorted((recording.with_suffix("") / "log").glob(f"{stage}-*.txt")):
+        for line in path.read_text(errors="replace").splitlines():
+            yield path.stem, line
+
+
+def newest_recording(folder: Path) -> Path:
+    """The recording that was begun last; raises Refused where there is none."""
+    found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise Refused(f"{folder}: no recordings; start a graph: runner up GRAPH, or name a folder: --recordings DIR")
+    return found[-1]

@@ -1,0 +1,1 @@
+"""A run that lives, as the command line sees it."""

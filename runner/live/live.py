@@ -1,0 +1,129 @@
+"""Reaches a run that lives, and asks its supervisor."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import TypeVar
+
+import msgspec
+import zenoh
+
+from runner.contract import Refused
+from runner.graph.document import suggest
+from runner.message.packet import Packet
+from runner.process.tap import Header, Listener
+from runner.supervise.calls import CallQuestion, CallRequest, CommandType, Progress
+from runner.supervise.registry import Entry, is_alive
+from runner.supervise.status import RunStatus
+from runner.transport.bus import Bus
+
+T = TypeVar("T")
+ANSWER_SECONDS = 10.0
+POLL_SECONDS = 0.1
+RESTART_SECONDS = 300.0
+"""Bringing a stage back takes as long as its models take to load."""
+
+
+WINDOW_NS = 10_000_000_000
+"""Rates are taken over the last ten seconds."""
+
+
+class Live:
+    """A connection to one run, to be used in a ``with`` statement."""
+
+    def __init__(self, entry: Entry) -> None:
+        """Raises Refused where the run does not answer any more."""
+        self.entry = entry
+        try:
+            self.bus = Bus(entry.run, connect=entry.endpoint, network=entry.network, secret=entry.secret, guest=True)
+        except zenoh.ZError as error:
+            raise Refused(f"{entry.run}: cannot be reached at {entry.endpoint}: {error}") from None
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.bus.close()
+
+    def status(self) -> RunStatus:
+        """How the run and each of its processes is."""
+        return self._ask("status", b"", RunStatus)
+
+    def wait_until_ready(self, say: Callable[[str], object] = lambda _: None) -> None:
+        """Waits for processes that still start; ``say`` is told which."""
+        waited_for: list[str] = []
+        while not (status := self.status()).ready:
+            starting = [process.name for process in status.processes if process.state == "starting"]
+            if starting and starting != waited_for:
+                say(f"waiting for {', '.join(starting)}")
+            waited_for = starting
+            time.sleep(POLL_SECONDS)
+
+    def commands(self) -> list[CommandType]:
+        """What its stages can be asked."""
+        return self._ask("commands", b"", list[CommandType])
+
+    def call(self, request: CallRequest) -> str:
+        """Calls a command and returns its id."""
+        return self.bus.ask("call", msgspec.json.encode(request), ANSWER_SECONDS).decode()
+
+    def follow(self, id: str) -> Iterator[Progress]:
+        """News of a call, until it is done."""
+        seen = 0
+        while True:
+            progress = self._ask("progress", msgspec.json.encode(CallQuestion(id, seen)), Progress)
+            seen += len(progress.lines)
+            yield progress
+            if progress.done:
+                return
+
+    def restart(self, process: str) -> str:
+        """Replaces one process in order; returns what became of it."""
+        return self.bus.ask("restart", process.encode(), RESTART_SECONDS).decode()
+
+    def down(self) -> None:
+        """Asks the run to end."""
+        self.bus.ask("down", b"", ANSWER_SECONDS)
+
+    def messages(self, topic: str) -> Iterator[Packet]:
+        """Messages of a topic (``stage/port``) from now on, until the run ends."""
+        listener = Listener(self.bus)
+        listener.messages(self._known(topic))
+        while True:
+            packets = list(listener.take(POLL_SECONDS))
+            yield from packets
+            if not packets and not is_alive(self.entry):
+                return
+
+    def headers(self, topic: str) -> Iterator[list[Header]]:
+        """Once a second the headers of the last ten seconds, until the run ends."""
+        listener, window = Listener(self.bus), deque[Packet]()
+        listener.headers(self._known(topic))
+        due = time.monotonic() + 1.0
+        while is_alive(self.entry):
+            window.extend(listener.take(POLL_SECONDS))
+            if time.monotonic() >= due:
+                due += 1.0
+                while window and window[0].arrived_ns < time.monotonic_ns() - WINDOW_NS:
+                    window.popleft()
+                yield [Header.unpack(packet.payload) for packet in window]
+
+    def _known(self, topic: str) -> str:
+        """The topic as its key spells it; raises Refused where the run has none of that name."""
+        name = topic.replace(".", "/", 1)
+        known = [found.topic for found in self.status().topics]
+        if name not in known:
+            raise Refused(f"{self.entry.run}: no topic {topic!r}{suggest(name, known)}")
+        return name
+
+    def _ask(self, name: str, question: bytes, kind: type[T]) -> T:
+        return msgspec.json.decode(self.bus.ask(name, question, ANSWER_SECONDS), type=kind)
+
+
+def wait_until_gone(entry: Entry) -> None:
+    """Returns once a run that ends has left nothing running."""
+    while is_alive(entry):
+        time.sleep(POLL_SECONDS)

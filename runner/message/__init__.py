@@ -1,0 +1,1 @@
+"""What travels between processes: its bytes, its name, and what is refused."""

@@ -1,0 +1,500 @@
+"""What goes over the wire and into recordings: msgpack maps, arrays with a checked type and shape, never pickle."""
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterable
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+
+from runner.contract import Level, Message, Spec
+
+M = TypeVar("M", bound=Message)
+R = TypeVar("R", bound=msgspec.Struct)
+
+Outcome = Literal["done", "stopped", "failed", "ended"]
+"""How a step ended: only ``done`` acknowledges what it consumed. ``ended`` is the last record of a process."""
+Activity = Literal["waiting", "working", "held back"]
+"""What a process does: wait for input, run a handler, or wait for room at its consumers."""
+MAX_BYTES = 256 * 2**20
+"""Largest payload that is decoded."""
+MAX_DIMENSIONS = 8
+IN_PLACE_BYTES = 2**16
+"""Arrays of larger messages are read where they lie."""
+ALIGNMENT = 16
+"""Of the elements of every array, as memory is allocated anyway: other code may be compiled for other arrays."""
+DTYPES = {
+    name: np.dtype(name)
+    for name in (
+        *("bool", "int8", "int16", "int32", "int64"),
+        *("uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"),
+    )
+}
+"""Element types an array may have, little-endian on the wire."""
+_NAMES = {dtype: name for name, dtype in DTYPES.items()}
+_BOOL = DTYPES["bool"]
+
+
+class CodecError(Exception):
+    """A payload or message that breaks its type: ``type`` and ``field`` say where, ``reason`` why."""
+
+    def __init__(self, type_name: str, field: str, reason: str):
+        self.type = type_name
+        self.field = field
+        self.reason = reason
+        super().__init__(f"{type_name}{'.' if field else ''}{field}: {reason}")
+
+
+MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$")]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class Envelope(msgspec.Struct, frozen=True):
+    """One message as it travels and is recorded: a msgpack map with the message itself under ``body``."""
+
+    id: MessageId
+    """``stage.port#sequence``."""
+    lineage: MessageId
+    """Id of the message at the root of everything this one hangs on."""
+    time_ns: Nanoseconds
+    """Logical time."""
+    type: str
+    """Class name of the message."""
+    version: int
+    causes: tuple[str, ...]
+    """Ids that the step which emitted this message had consumed."""
+    body: msgspec.Raw
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One journalled step of one stage: what it consumed and emitted, in which order, and how long it took."""
+
+    stage: str
+    replica: Count
+    incarnation: Count
+    """0 for the first process of this replica, one more after each restart."""
+    number: Count
+    """Counts the steps of one process from 0."""
+    handler: str
+    consumed: tuple[tuple[str, MessageId], ...]
+    """(port, message id) in the order of the handler's parameters; a gather's parts by index."""
+    emitted: tuple[MessageId, ...]
+    """Ids in the order of emission."""
+    time_ns: Nanoseconds
+    """Logical time of the step."""
+    waited_ns: int
+    """From the arrival of the last input to the start of the handler."""
+    travelled_ns: int
+    """From the publication of the last input to its arrival."""
+    computed_ns: int
+    """Time inside the handler."""
+    outcome: Outcome = "done"
+    error: str = ""
+    left: tuple[tuple[str, MessageId], ...] = ()
+    """(port, message id) of what has arrived and no step of this process will consume: it was refused, or put aside
+    unused, or the process ended before; said once."""
+
+
+class Lost(msgspec.Struct, frozen=True):
+    """The supervisor's word that a process is dead, whatever else is heard of it: the one thing that makes it so."""
+
+    stage: str
+    replica: Count
+    incarnation: Count
+    reason: str
+    time_ns: Nanoseconds
+    """Wall clock, nanoseconds since the epoch."""
+
+
+class Journal(msgspec.Struct, frozen=True):
+    """Steps of one stage that the recorder has, in its order."""
+
+    steps: tuple[Step, ...]
+
+
+class Receipt(msgspec.Struct, frozen=True):
+    """What a consumer says of one message (port, id) as it arrives, before it is worked on."""
+
+    port: str
+    id: MessageId
+    consumed: bool = False
+    """True for one that arrived again after it had been consumed."""
+
+
+class LogLine(msgspec.Struct, frozen=True):
+    """One line a stage (or the supervisor) shows to people."""
+
+    stage: str
+    replica: int
+    level: Level
+    text: str
+    time_ns: Nanoseconds
+    """Wall clock, nanoseconds since the epoch."""
+
+
+class Pulse(msgspec.Struct, frozen=True):
+    """What a process says of itself twice a second, of the recorder too; it is not recorded."""
+
+    stage: str
+    replica: int
+    incarnation: int
+    pid: int
+    host: str
+    """Name of the machine."""
+    state: Activity = "waiting"
+    handler: str = ""
+    """What runs at present; empty while waiting."""
+    busy_ns: int = 0
+    """Time spent inside the present handler, back-pressure not counted."""
+    steps: int = 0
+    refused: int = 0
+    """Messages that could not be taken."""
+    queued: dict[str, int] = {}
+    """Messages that have arrived and are not worked on, by input port."""
+    skipped: dict[str, int] = {}
+    """Messages that newer ones replaced before they were read, by input port."""
+    unanswered: dict[str, int] = {}
+    """Messages that consumers have not done with, by ``stage.port`` of the consumer."""
+    sent: dict[str, tuple[int, int]] = {}
+    """(messages, bytes) emitted so far, by output port."""
+    cpu_ns: int = 0
+    """Processor time of all its threads since it began."""
+    memory_bytes: int = 0
+    """What it holds in memory (resident set)."""
+
+
+# ---------------------------------------------------------------------------------------------- arrays
+
+
+def _to_wire(value: Any) -> Any:
+    """Arrays become ``[dtype, shape, bytes]``, numpy scalars plain numbers."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if not isinstance(value, np.ndarray):
+        raise ValueError(f"{type(value).__name__} cannot be encoded")
+    name = _NAMES.get(value.dtype)
+    if name is None:
+        raise ValueError(f"an array of {value.dtype} cannot be encoded; valid: {', '.join(DTYPES)}")
+    # In C order, and not copied where the elements lie so.
+    return [name, value.shape, value.data if value.flags.c_contiguous else value.tobytes()]
+
+
+def _from_wire(kind: type, value: Any) -> Any:
+    """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
+    if isinstance(value, np.ndarray):  # of a message that is checked before it travels
+        return cast("Any", value)
+    if getattr(kind, "__origin__", None) is not np.ndarray:
+        raise ValueError(f"{kind} cannot be decoded")
+    match value:
+        case [str() as name, list() as shape, bytes() as data]:
+            return _array(name, cast("list[Any]", shape), data)
+        case _:
+            raise ValueError("expected an array as [dtype, shape, bytes]")
+
+
+def _array(name: str, shape: list[Any], data: bytes | memoryview) -> np.ndarray:
+    dtype = DTYPES.get(name)
+    if dtype is None:
+        raise ValueError(f"element type {name[:20]!r} is not one of {', '.join(DTYPES)}")
+    if len(shape) > MAX_DIMENSIONS or [one for one in shape if type(one) is not int or one < 0]:
+        raise ValueError(f"shape {str(shape)[:60]} is not a list of at most {MAX_DIMENSIONS} extents")
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {name}")
+    if dtype is _BOOL and bytes(data).strip(b"\x00\x01"):
+        raise ValueError("a bool is neither 0 nor 1")
+    return np.ndarray(shape, dtype, buffer=data)
+
+
+def _check_array(array: np.ndarray, spec: Spec, place: str) -> None:
+    """Raises ValueError unless the array is what its field declares."""
+    if array.dtype != DTYPES[spec.dtype]:
+        raise ValueError(f"expected {spec.dtype}, got {array.dtype.name} - at `{place}`")
+    if not _fits(array.shape, spec.shape):
+        raise ValueError(f"expected shape {_shape(spec.shape)}, got {_shape(array.shape)} - at `{place}`")
+    if spec.finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"NaN or infinity in {np.count_nonzero(~np.isfinite(array))} elements - at `{place}`")
+
+
+def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
+    if len(shape) != len(pattern):
+        return False
+    named: dict[str, int] = {}
+    for extent, want in zip(shape, pattern, strict=True):
+        if extent != (named.setdefault(want, extent) if isinstance(want, str) else want):
+            return False
+    return True
+
+
+def _shape(extents: Iterable[int | str]) -> str:
+    return f"({', '.join(str(extent) for extent in extents)})"
+
+
+# ---------------------------------------------------------------------------------------------- checks
+
+Check = Callable[[Any, str], None]
+"""Checks the arrays inside one value; the second argument is its place within the message."""
+
+
+@cache
+def _struct_checks(kind: type[msgspec.Struct]) -> tuple[tuple[str, Check], ...]:
+    """The fields of a struct that may hold arrays, each with its check."""
+    hints = get_type_hints(kind, include_extras=True)
+    checks = ((name, _check_of(hints[name])) for name in kind.__struct_fields__)
+    return tuple((name, check) for name, check in checks if check is not None)
+
+
+def _check_of(annotation: Any) -> Check | None:
+    """The check for values of one annotation, or None where they hold no arrays."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        spec = next((extra for extra in arguments[1:] if isinstance(extra, Spec)), None)
+        return _check_of(arguments[0]) if spec is None else lambda value, place: _check_array(value, spec, place)
+    if origin is np.ndarray or annotation is np.ndarray:
+        raise TypeError("an array field needs its Spec: Annotated[NDArray[...], Spec(dtype, shape)]")
+    if origin in (Union, UnionType):
+        return _check_union(arguments)
+    if origin in (tuple, list):
+        return _check_items(_check_of(arguments[0]))
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+        return _check_struct
+    return None
+
+
+def _check_struct(value: Any, place: str) -> None:
+    for name, check in _struct_checks(type(value)):
+        check(getattr(value, name), f"{place}.{name}")
+
+
+def _check_union(members: tuple[Any, ...]) -> Check | None:
+    checks = [check for check in map(_check_of, members) if check is not None]
+    if not checks:
+        return None
+
+    def check_present(value: Any, place: str) -> None:
+        if value is not None:
+            checks[0](value, place)
+
+    return check_present
+
+
+def _check_items(check: Check | None) -> Check | None:
+    if check is None:
+        return None
+
+    def check_each(values: Any, place: str) -> None:
+        for index, value in enumerate(values):
+            check(value, f"{place}[{index}]")
+
+    return check_each
+
+
+# ---------------------------------------------------------------------------------------------- encode, decode
+
+_BINARY = (bytes, bytearray, memoryview)
+_BIN_32 = b"\xc6"
+"""Byte that begins binary data of more than 64 KiB in msgpack; its length follows in four."""
+_CUT = os.urandom(16)
+"""Stands where an array of a message goes; no message can hold it by itself."""
+
+
+@cache
+def _encoder() -> msgspec.msgpack.Encoder:
+    return msgspec.msgpack.Encoder(enc_hook=_to_wire)
+
+
+@cache
+def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(kind, dec_hook=_from_wire)
+
+
+def encode(message: Message) -> bytes:
+    """The message's bytes; raises CodecError where a field is not what its class declares."""
+    return b"".join(_encode_in_parts(message))
+
+
+def _encode_in_parts(message: Message) -> tuple[bytes | memoryview, ...]:
+    """What msgspec would write, cut where large arrays lie: they are parts of their own."""
+    arrays: list[memoryview] = []
+
+    def to_wire(value: Any) -> Any:
+        wire = _to_wire(value)
+        if isinstance(wire, list) and value.nbytes > IN_PLACE_BYTES:
+            arrays.append(memoryview(wire[2]).cast("B"))
+            wire[2] = msgspec.Raw(_BIN_32 + value.nbytes.to_bytes(4, "big") + _CUT)
+        return cast("Any", wire)
+
+    try:
+        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
+        _check_fields(message)
+    except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
+        raise _codec_error(type(message).__name__, error) from None
+    if not arrays:
+        return (body,)
+    first, *others = body.split(_CUT)
+    return (first, *(part for pair in zip(arrays, others, strict=True) for part in pair))
+
+
+def _check_fields(message: Message) -> None:
+    """What decoding would check, without copying arrays, and made where the blame lies: at the publisher."""
+    values = msgspec.to_builtins(message, builtin_types=(np.ndarray, *_BINARY), enc_hook=_to_wire)
+    msgspec.convert(values, type(message), builtin_types=_BINARY, dec_hook=_from_wire)
+    _check_struct(message, "")
+
+
+def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
+    """Reads one message of a known class; raises CodecError and nothing else, whatever the bytes."""
+    message = _decode_in_place(kind, body) if memoryview(body).nbytes > IN_PLACE_BYTES else None
+    if message is None:
+        message = _decode(kind, body)
+    try:
+        _check_struct(message, "")
+    except ValueError as error:
+        raise _codec_error(kind.__name__, error) from None
+    return message
+
+
+def _decode_in_place(kind: type[M], body: bytes | msgspec.Raw) -> M | None:
+    """Reads a message without copying its arrays; None where something is wrong with it, for others to say what."""
+    fields, values = _field_decoders(kind), dict[str, Any]()
+    try:
+        for name, raw in _decoder(dict[str, msgspec.Raw]).decode(body).items():
+            if name in fields:
+                values[name] = _array_in_place(raw) if fields[name] is None else fields[name].decode(raw)
+        return kind(**values)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError):
+        return None
+
+
+@cache
+def _field_decoders(kind: type[Message]) -> dict[str, Any]:
+    """By field of a message; None for arrays."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: None if _is_array(hints[name]) else _decoder(hints[name]) for name in kind.__struct_fields__}
+
+
+def _is_array(annotation: Any) -> bool:
+    return get_origin(annotation) is Annotated and get_origin(get_args(annotation)[0]) is np.ndarray
+
+
+def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
+    name, shape, data = _decoder(tuple[str, list[Any], memoryview]).decode(raw)
+    array = _array(name, shape, data)
+    if array.itemsize == 1 or array.ctypes.data % ALIGNMENT == 0:
+        return array
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def pack(record: Envelope | Step | Journal | Receipt | LogLine | Pulse) -> bytes:
+    """A record's bytes, on the wire and in a recording alike."""
+    return _encoder().encode(record)
+
+
+def unpack(kind: type[R], payload: bytes | memoryview) -> R:
+    """Reads a record; raises CodecError and nothing else, whatever the bytes."""
+    return _decode(kind, payload)
+
+
+class Draft(msgspec.Struct, frozen=True):
+    """An envelope whose body is still in parts: large arrays are not copied, and must not change."""
+
+    cover: Envelope
+    """All but the body."""
+    body: tuple[bytes | memoryview, ...]
+
+    def sealed(self) -> Envelope:
+        """The envelope, with a body of its own."""
+        return msgspec.structs.replace(self.cover, body=msgspec.Raw(b"".join(self.body)))
+
+    def parts(self) -> tuple[bytes | memoryview, ...]:
+        """What :func:`pack` makes of the envelope: a map whose last value is the body."""
+        return pack(self.cover), *self.body
+
+
+def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
+    """Wraps a message for its journey; raises CodecError where the message breaks its class."""
+    kind = type(message)
+    cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
+    return Draft(cover, _encode_in_parts(message))
+
+
+def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
+    """Wraps a message as :func:`draft` does, in one piece."""
+    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).sealed()
+
+
+def open_envelope(kind: type[M], sealed: Envelope) -> M:
+    """The message inside, which must be of the given class and version."""
+    if sealed.type != kind.__name__:
+        raise CodecError("Envelope", "type", f"expected {kind.__name__}, got {sealed.type[:60]!r}")
+    if sealed.version != kind.version:
+        raise CodecError("Envelope", "version", f"expected {kind.__name__} {kind.version}, got {sealed.version}")
+    return decode(kind, sealed.body)
+
+
+class Fields(dict[str, Any]):
+    """A message or struct whose class is not known: its fields by name."""
+
+
+def decode_untyped(body: bytes | msgspec.Raw) -> Any:
+    """Reads a message without knowing its class: maps as :class:`Fields`, arrays as arrays. Raises CodecError."""
+    return _named(_decode(cast("type[msgspec.Struct]", Any), body))
+
+
+def _named(value: Any) -> Any:
+    match value:
+        case dict():
+            return Fields({str(key): _named(inner) for key, inner in cast("dict[Any, Any]", value).items()})
+        case [str() as name, list() as shape, bytes() as data] if name in DTYPES:
+            try:
+                return _array(name, cast("list[Any]", shape), data)
+            except ValueError as error:
+                raise CodecError("array", "", str(error)) from None
+        case list():
+            return [_named(inner) for inner in cast("list[Any]", value)]
+        case _:
+            return value
+
+
+def _decode(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
+    size = memoryview(payload).nbytes
+    if size > MAX_BYTES:
+        raise CodecError(kind.__name__, "", f"{size} bytes are more than the limit of {MAX_BYTES}")
+    try:
+        return _decoder(kind).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
+        raise _codec_error(kind.__name__, error) from None
+
+
+def _codec_error(type_name: str, error: Exception) -> CodecError:
+    """Splits the place off an error text of the form ``reason - at `$.field```."""
+    reason, _, place = str(error).partition(" - at `")
+    return CodecError(type_name, re.sub(r"^\$?\.?|`$", "", place), reason)
+
+
+# ---------------------------------------------------------------------------------------------- schemas
+
+
+def json_schema(kind: type[Message]) -> dict[str, Any]:
+    """JSON Schema of the map that carries one message type: the envelope with its body."""
+    _, definitions = msgspec.json.schema_components(
+        [kind, Envelope], schema_hook=_array_schema, ref_template="#/$defs/{name}"
+    )
+    body = definitions.pop(kind.__name__)
+    schema = definitions.pop("Envelope")
+    schema["title"], schema["properties"]["body"] = kind.__name__, body
+    return {**schema, "$defs": definitions} if definitions else schema
+
+
+def _array_schema(kind: type) -> dict[str, Any]:
+    if not issubclass(kind, np.ndarray):
+        raise NotImplementedError
+    extents = {"type": "array", "items": {"type": "integer", "minimum": 0}, "maxItems": MAX_DIMENSIONS}
+    data = {"type": "string", "contentEncoding": "binary"}
+    return {"title": "array", "type": "array", "prefixItems": [{"enum": list(DTYPES)}, extents, data]}

@@ -1,0 +1,1 @@
+"""One process of a graph: a stage's, or the recorder's."""

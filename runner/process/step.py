@@ -1,0 +1,198 @@
+"""Executes one step of one stage; the same code runs live and in a replay."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from runner.contract import Level, Message, Stage
+from runner.graph.graph import Node
+from runner.graph.ports import Handler, InputPort, port_name
+from runner.message import codec
+from runner.message.codec import Draft, Envelope
+
+Log = Callable[[str, Level], None]
+"""Takes one line of a stage's log."""
+
+
+class BrokenContract(Exception):
+    """A stage that did not do what its annotations say."""
+
+
+class Arrival(msgspec.Struct, frozen=True):
+    """A message at an input port."""
+
+    port: InputPort
+    envelope: Envelope
+    message: Message
+    arrived_ns: int = 0
+    """Monotonic clock."""
+    travelled_ns: int = 0
+
+
+def receive(port: InputPort, envelope: Envelope, *, arrived_ns: int = 0, travelled_ns: int = 0) -> Arrival:
+    """Decodes what arrived at a port; raises CodecError where it is not of the port's type."""
+    message = codec.open_envelope(port.type, envelope)
+    return Arrival(port, envelope, message, arrived_ns, travelled_ns)
+
+
+class StepContext:
+    """What a handler may know of its step (:class:`runner.contract.Context`)."""
+
+    def __init__(self, *, time_ns: int, seed: Callable[[], int], directory: Path, log: Log):
+        """``seed`` is asked when random numbers are wanted."""
+        self.time_ns = time_ns
+        self._seed = seed
+        self._rng: np.random.Generator | None = None
+        self._directory = directory
+        self._log = log
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Random numbers of this step, made when they are first asked for."""
+        if self._rng is None:
+            self._rng = np.random.default_rng(self._seed())
+        return self._rng
+
+    @property
+    def directory(self) -> Path:
+        """Folder beside the recording."""
+        return self._directory
+
+    def log(self, text: str, *, level: Level = "info") -> None:
+        """Shows and records one line."""
+        self._log(text, level)
+
+
+class Executor:
+    """Runs the handlers of one stage and wraps what they return as envelopes with their ids."""
+
+    def __init__(
+        self,
+        node: Node,
+        stage: Stage,
+        *,
+        seed: int,
+        directory: Path,
+        log: Log,
+        numbers: Mapping[str, int] | None = None,
+    ):
+        """``seed`` is the graph's; ``numbers`` the next sequence number of output ports already in use."""
+        self._node = node
+        self._stage = stage
+        self._seed = seed
+        self._directory = directory
+        self._log = log
+        self._numbers = dict(numbers or {})
+
+    def run(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Envelope]:
+        """Calls a handler as :meth:`drafts` does and yields what it emits in envelopes."""
+        for draft in self.drafts(handler, arrivals, time_ns):
+            yield draft.sealed()
+
+    def drafts(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Draft]:
+        """Calls a handler and yields its messages as it emits them.
+
+        ``arrivals`` are in the order of the handler's parameters, the parts of a gather by index;
+        ``time_ns`` is the step's logical time. Raises whatever the handler raises, CodecError for a message
+        that breaks its class and BrokenContract for one that the annotations do not announce.
+        """
+        driver = driver_of(handler, arrivals)
+        context = self._context(handler, driver, time_ns)
+        arguments = _arguments(arrivals)
+        if handler.context is not None:
+            arguments[handler.context] = context
+        causes = tuple(arrival.envelope.id for arrival in arrivals)
+        taken: set[str] = set()
+        for message in _messages(getattr(self._stage, handler.name)(**arguments)):
+            yield self._draft(message, driver, causes, context.time_ns, taken)
+
+    def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft]:
+        """Yields the messages of a device's source; each is a step of its own at the clock's time."""
+        context = self._context(handler, None, clock())
+        arguments = {} if handler.context is None else {handler.context: context}
+        for message in getattr(self._stage, handler.name)(**arguments):
+            context.time_ns = clock()
+            yield self._draft(message, None, (), context.time_ns, set())
+
+    def _context(self, handler: Handler, driver: Envelope | None, time_ns: int) -> StepContext:
+        identity = handler.name if driver is None else driver.id
+        seed = partial(step_seed, self._seed, self._node.name, identity)
+        return StepContext(time_ns=time_ns, seed=seed, directory=self._directory, log=self._log)
+
+    def _draft(
+        self, message: Message, driver: Envelope | None, causes: tuple[str, ...], time_ns: int, taken: set[str]
+    ) -> Draft:
+        port = self._port_of(message)
+        own = f"{self._node.name}.{port}#{self._number(port, driver, taken)}"
+        lineage = own if driver is None or message.starts_lineage else driver.lineage
+        return codec.draft(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
+
+    def _port_of(self, message: Message) -> str:
+        port = port_name(type(message))
+        if self._node.type.outputs.get(port) is not type(message):
+            announced = ", ".join(self._node.type.outputs) or "nothing"
+            raise BrokenContract(f"emitted a {type(message).__name__}; its annotations announce {announced}")
+        return port
+
+    def _number(self, port: str, driver: Envelope | None, taken: set[str]) -> int:
+        """Contiguous by port; a replica takes its part's number, so that ids do not depend on who worked."""
+        if self._node.replicated and driver is not None:
+            if port in taken:
+                raise BrokenContract(f"emitted two {port} in one step, which a replicated stage may not")
+            taken.add(port)
+            return sequence_of(driver.id)
+        number = self._numbers.get(port, 0)
+        self._numbers[port] = number + 1
+        return number
+
+
+def step_seed(seed: int, stage: str, identity: str) -> int:
+    """256 bits from the graph's seed, the stage and what drives the step, and from nothing else."""
+    digest = hashlib.sha256(f"{seed}\0{stage}\0{identity}".encode()).digest()
+    return int.from_bytes(digest, "big")
+
+
+def driver_of(handler: Handler, arrivals: Sequence[Arrival]) -> Envelope | None:
+    """The message that seeds the step and hands its lineage on; None for a start."""
+    name = handler.driver.name if handler.driver is not None else ""
+    return next((arrival.envelope for arrival in arrivals if arrival.port.name == name), None)
+
+
+def step_time(node: Node, arrivals: Sequence[Arrival], now_ns: int) -> int:
+    """Logical time: the newest of what is consumed; the clock's where nothing is, and for devices."""
+    if node.type.cls.device or not arrivals:
+        return now_ns
+    return max(arrival.envelope.time_ns for arrival in arrivals)
+
+
+def sequence_of(message_id: str) -> int:
+    """The number at the end of ``stage.port#number``."""
+    return int(message_id.rpartition("#")[2])
+
+
+def _arguments(arrivals: Sequence[Arrival]) -> dict[str, Any]:
+    arguments: dict[str, Any] = {}
+    for arrival in arrivals:
+        if arrival.port.kind == "gather":
+            arguments.setdefault(arrival.port.name, []).append(arrival.message)
+        else:
+            arguments[arrival.port.name] = arrival.message
+    return arguments
+
+
+def _messages(result: Message | Iterable[Message] | None) -> Iterator[Message]:
+    """What a handler returned, as an iterator."""
+    if isinstance(result, Message):
+        yield result
+    elif result is not None:
+        try:
+            messages = iter(result)
+        except TypeError:
+            given = type(result).__name__
+            raise BrokenContract(f"returned {given} instead of a message or an iterator of them") from None
+        yield from messages

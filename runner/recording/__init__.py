@@ -1,0 +1,1 @@
+"""A recording: the file, what is in it, where it comes from, and making it whole."""

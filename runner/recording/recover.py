@@ -1,0 +1,59 @@
+"""Writes what a torn or damaged recording still holds as a clean, indexed one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO
+
+from mcap.writer import CompressionType, Writer
+
+from runner.contract import Refused
+from runner.recording.container import Entry, is_being_written, open_file
+from runner.recording.recording import PROFILE, VERDICT, Recording
+
+SUFFIX = ".recovered.mcap"
+CHUNK_BYTES = 4 * 2**20
+
+
+def recover(path: Path, target: Path | None = None) -> tuple[Recording, Path]:
+    """Copies every readable payload, the metadata and the verdict; returns what was read and where it was written.
+
+    By default ``run.mcap`` becomes ``run.recovered.mcap``. Raises Refused where the file is still being written or no
+    recording, or where the target exists.
+    """
+    target = target or path.with_name(path.name.removesuffix(".mcap") + SUFFIX)
+    with open_file(path) as file:
+        if is_being_written(file):
+            raise Refused(f"{path}: is still being written; valid: the recording of a graph that has ended")
+    recording = Recording(path)
+    try:
+        with target.open("xb") as output:
+            _copy(recording, output)
+    except OSError as error:
+        raise Refused(f"{target}: cannot be written: {error.strerror}") from None
+    return recording, target
+
+
+def _copy(recording: Recording, output: IO[bytes]) -> None:
+    verdict = recording.verdict
+    writer = Writer(output, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer.start(profile=PROFILE)
+    channels: dict[int, int] = {}
+    for record in recording.records():
+        if isinstance(record, Entry):
+            if record.channel not in channels:
+                channels[record.channel] = _register(recording, record.channel, writer)
+            times = record.log_time_ns, record.data, record.publish_time_ns, record.sequence
+            writer.add_message(channels[record.channel], *times)
+        elif record.name != VERDICT:
+            writer.add_metadata(record.name, record.metadata)
+    writer.flush()
+    writer.add_metadata(VERDICT, verdict.metadata())
+    writer.finish()
+
+
+def _register(recording: Recording, number: int, writer: Writer) -> int:
+    channel = recording.channels[number]
+    schema = recording.schemas.get(channel.schema_id)
+    known = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
+    return writer.register_channel(channel.topic, channel.message_encoding, known, channel.metadata)

@@ -1,0 +1,1 @@
+"""A recording executed again: replay, what if, time travel."""

@@ -1,0 +1,337 @@
+"""Executes some stages of a recording again while all others stay as recorded; joins and gathers are made anew.
+
+Every stage executes in a process of its own. What happens does not depend on which of them is faster: a stage takes
+the steps that its journal names in their order, and where it waits for one that will not come any more, everything
+stands still before the oldest step that could run is taken instead.
+"""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import cast
+
+import msgspec
+
+from runner.contract import Refused
+from runner.graph.graph import Graph, Node
+from runner.message.codec import CodecError, Envelope, Step, pack, unpack
+from runner.process.inbox import Inbox, Mismatched, Ready
+from runner.process.step import Executor, receive, step_time
+from runner.recording.recording import Recording, replicated, split_id
+from runner.replay.workshop import Forked
+
+AHEAD = 16
+"""Recorded messages that are delivered while steps run; more would only wait in memory."""
+Key = tuple[str, str, str, int]
+"""A step by what it is, whatever it consumes: stage, handler, lineage, and how many such steps come before it."""
+
+
+class Request(msgspec.Struct, frozen=True):
+    """A step that a stage's process is to take."""
+
+    handler: str
+    inputs: tuple[tuple[str, bytes], ...]
+    """(port, envelope)."""
+    time_ns: int
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """What came of it."""
+
+    emitted: tuple[bytes, ...] = ()
+    error: str = ""
+    seconds: float = 0.0
+
+
+def host(node: Node, seed: int, directory: Path, connection: Connection) -> None:
+    """Runs one stage in this process; every request on the connection is a step."""
+    try:
+        stage = node.construct()
+    except Refused as refusal:
+        connection.send_bytes(msgspec.msgpack.encode(Answer(error=str(refusal))))
+        return
+    executor = Executor(node, stage, seed=seed, directory=directory, log=lambda *_: None)
+    connection.send_bytes(msgspec.msgpack.encode(Answer()))
+    while request := connection.recv_bytes():
+        answer = _answer(node, executor, msgspec.msgpack.decode(request, type=Request))
+        connection.send_bytes(msgspec.msgpack.encode(answer))
+    stage.close()
+
+
+def _answer(node: Node, executor: Executor, request: Request) -> Answer:
+    began, emitted, error = time.perf_counter(), list[bytes](), ""
+    handler = next(handler for handler in node.type.handlers if handler.name == request.handler)
+    try:
+        ports = node.type.inputs
+        arrivals = [receive(ports[port], unpack(Envelope, data)) for port, data in request.inputs]
+        emitted += (pack(sealed) for sealed in executor.run(handler, arrivals, request.time_ns))
+    except Exception as problem:
+        error = f"{type(problem).__name__}: {problem}"
+    return Answer(tuple(emitted), error, time.perf_counter() - began)
+
+
+@dataclass(slots=True)
+class _Stage:
+    """One executed stage, as the scheduler sees it."""
+
+    node: Node
+    inbox: Inbox
+    idle: list[Forked]
+    expected: deque[Key]
+    """The recorded steps that are still to come, in order."""
+    ready: dict[Key, Ready] = field(default_factory=dict[Key, Ready])
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
+    """Steps that became ready, by handler and lineage."""
+
+    def add(self, ready: Ready) -> None:
+        """Takes a step that can run."""
+        lineage = ready.arrivals[0].envelope.lineage if ready.arrivals else ""
+        place = (ready.handler.name, lineage)
+        self.ready[self.node.name, *place, self.counts[place]] = ready
+        self.counts[place] += 1
+
+    def permitted(self) -> Key | None:
+        """The step to take now: the next of the journal; replicas have no memory and take any."""
+        if not self.idle or not self.ready:
+            return None
+        if self.node.replicated:
+            return next(iter(self.ready))
+        return self.expected[0] if self.expected and self.expected[0] in self.ready else None
+
+    def take(self, key: Key) -> tuple[Ready, Forked]:
+        """Hands a step to a process; recorded ones before it will not be waited for any more."""
+        if not self.node.replicated and key in self.expected:
+            while self.expected.popleft() != key:
+                pass
+        return self.ready.pop(key), self.idle.pop()
+
+
+class Cone:
+    """The executed part of a graph, between what is recorded and what is compared."""
+
+    def __init__(self, recording: Recording, graph: Graph, names: Collection[str], *, workers: int, folder: Path):
+        """Starts the processes of all ``names``; raises Refused where a stage cannot be constructed."""
+        self.emitted: dict[str, Envelope] = {}
+        """By id, in the order of emission."""
+        self.errors: list[str] = []
+        self.seconds = 0.0
+        self._recording = recording
+        self._graph = graph
+        self._workers = workers
+        self._ranks, self._times = _journal(recording)
+        self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
+        self._frozen = _Frozen(recording, names)
+        self._ahead = 0
+        self._running: dict[Connection, tuple[_Stage, Key, Forked]] = {}
+        self._forked: list[Forked] = []
+        self._stages = {name: self._start(graph.nodes[name], folder) for name in graph.nodes if name in names}
+
+    def run(self) -> None:
+        """Executes until nothing is left to do, and leaves no process behind."""
+        try:
+            for child in self._forked:
+                self._await_construction(child)
+            self._start_handlers()
+            while self._advance():
+                pass
+        finally:
+            for child in self._forked:
+                child.kill()
+
+    @property
+    def frozen(self) -> dict[str, Envelope]:
+        """The recorded messages that took part, by id."""
+        return self._frozen.released
+
+    def never_came(self) -> list[str]:
+        """Ids of recorded messages of devices that answered what is not asked any more."""
+        return self._frozen.blocked()
+
+    # ------------------------------------------------------------------------------------ processes
+
+    def _start(self, node: Node, folder: Path) -> _Stage:
+        node = replace(node, inputs={port: replace(edge, policy="block") for port, edge in node.inputs.items()})
+        files = folder / node.name
+        files.mkdir()
+        idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
+        return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+
+    def _expected(self, node: Node) -> list[Key]:
+        """The recorded steps of a stage, in order: the journal's, or where replicas shared them, that of the looks."""
+        keys = [key for key in self._ranks if key[0] == node.name]
+        if node.name not in replicated(self._recording.graph):
+            return keys
+        place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
+        return sorted(keys, key=lambda key: (split_id(key[2]), place.get(key[1], len(place)), key[3]))
+
+    def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
+        log = folder / f"{node.name}-{len(self._forked)}.txt"
+        child = Forked(lambda connection: host(node, self._graph.seed, files, connection), log)
+        self._forked.append(child)
+        return child
+
+    def _await_construction(self, child: Forked) -> None:
+        try:
+            error = msgspec.msgpack.decode(child.receive(), type=Answer).error
+        except EOFError:
+            error = f"{child.log.stem}: {child.end()}"
+        if error:
+            raise Refused(error)
+
+    # ------------------------------------------------------------------------------------ scheduling
+
+    def _start_handlers(self) -> None:
+        for stage in self._stages.values():
+            for handler in stage.node.type.handlers:
+                if not handler.inputs:
+                    stage.add(Ready(handler, ()))
+
+    def _advance(self) -> bool:
+        """Takes one action; False where there is none left."""
+        if len(self._running) < self._workers:
+            for stage in self._stages.values():
+                key = stage.permitted()
+                if key is not None:
+                    self._dispatch(stage, key)
+                    return True
+            if self._ahead < AHEAD and self._release():
+                return True
+        if self._running:
+            self._collect()
+            return True
+        return self._force()
+
+    def _force(self) -> bool:
+        """Takes the oldest step that could run though others were recorded before it: those will not come."""
+        keys = [key for stage in self._stages.values() for key in stage.ready]
+        if keys:
+            key = min(keys, key=self._rank)
+            self._dispatch(self._stages[key[0]], key)
+        return bool(keys)
+
+    def _rank(self, key: Key) -> tuple[int, tuple[str, int], Key]:
+        """Where a step stands in the recording; new ones come last, by lineage."""
+        return self._ranks.get(key, len(self._ranks)), split_id(key[2]), key
+
+    def _dispatch(self, stage: _Stage, key: Key) -> None:
+        ready, child = stage.take(key)
+        inputs = tuple((arrival.port.name, pack(arrival.envelope)) for arrival in ready.arrivals)
+        time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
+        child.connection.send_bytes(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
+        self._running[child.connection] = (stage, key, child)
+
+    def _collect(self) -> None:
+        connection = cast("Connection", wait(list(self._running))[0])
+        stage, key, child = self._running.pop(connection)
+        try:
+            answer = msgspec.msgpack.decode(child.receive(), type=Answer)
+        except EOFError:
+            raise Refused(f"{_step_name(key)}: {child.end()}") from None
+        self._ahead = 0
+        stage.idle.append(child)
+        self.seconds += answer.seconds
+        if answer.error:
+            self.errors.append(f"{_step_name(key)}: {answer.error}")
+        for data in answer.emitted:
+            sealed = unpack(Envelope, data)
+            self.emitted[sealed.id] = sealed
+            self._frozen.came(sealed.id)
+            self._deliver(sealed, recorded=False)
+
+    def _release(self) -> bool:
+        """Delivers the next message that stays as recorded."""
+        sealed = self._frozen.next()
+        if sealed is not None:
+            self._ahead += bool(self._running)
+            self._deliver(sealed, recorded=True)
+        return sealed is not None
+
+    def _deliver(self, sealed: Envelope, *, recorded: bool) -> None:
+        source, _, port = split_id(sealed.id)[0].partition(".")
+        for route in self._graph.routes(source):
+            stage = self._stages.get(route.consumer)
+            if route.output != port or stage is None:
+                continue
+            if recorded and route.policy == "latest" and (route.consumer, route.input, sealed.id) not in self._consumed:
+                continue  # a newer one replaced it
+            self._add(stage, route.input, sealed)
+
+    def _add(self, stage: _Stage, port: str, sealed: Envelope) -> None:
+        try:
+            stage.inbox.add(receive(stage.node.type.inputs[port], sealed))
+        except (CodecError, Mismatched) as error:
+            self.errors.append(f"{stage.node.name}.{port}: {sealed.id} refused: {error}")
+        while ready := stage.inbox.pop():
+            stage.add(ready)
+
+
+class _Frozen:
+    """The messages that stay as recorded: each comes once all that it answers has come."""
+
+    def __init__(self, recording: Recording, names: Collection[str]) -> None:
+        self.released: dict[str, Envelope] = {}
+        self._recording = recording
+        self._came: set[str] = set()
+        self._positions = {id: position for position, id in enumerate(recording.messages)}
+        frozen = (id for id in recording.messages if id.partition(".")[0] not in names)
+        self._free = [(self._positions[id], id) for id in frozen]
+        """A heap: what may come, oldest first."""
+        self._waiting: dict[str, list[str]] = defaultdict(list)
+        """Ids by the cause that has not come yet."""
+
+    def next(self) -> Envelope | None:
+        """The oldest message whose causes have all come; None where there is none at present."""
+        while self._free:
+            _, id = heapq.heappop(self._free)
+            sealed = self._recording.envelope(id)
+            cause = next(self._lacking(sealed), None)
+            if cause is None:
+                self.released[id] = sealed
+                self.came(id)
+                return sealed
+            self._waiting[cause].append(id)
+        return None
+
+    def came(self, id: str) -> None:
+        """Takes note of a message, recorded or new."""
+        self._came.add(id)
+        for waiting in self._waiting.pop(id, ()):
+            heapq.heappush(self._free, (self._positions[waiting], waiting))
+
+    def blocked(self) -> list[str]:
+        """What has not come, in order."""
+        return sorted((id for ids in self._waiting.values() for id in ids), key=self._positions.__getitem__)
+
+    def _lacking(self, sealed: Envelope) -> Iterator[str]:
+        return (cause for cause in sealed.causes if cause in self._positions and cause not in self._came)
+
+
+def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
+    """The order and the logical time of every step that was done."""
+    done = [step for step in recording.steps if step.outcome == "done" and step.handler != "source"]
+    done.sort(key=lambda step: step.incarnation)  # stable: within a process the journal has them in order
+    counts: Counter[tuple[str, str, str]] = Counter()
+    ranks: dict[Key, int] = {}
+    times: dict[Key, int] = {}
+    for step in done:
+        place = (step.stage, step.handler, _lineage(recording, step))
+        key = (*place, counts[place])
+        counts[place] += 1
+        ranks[key], times[key] = len(ranks), step.time_ns
+    return ranks, times
+
+
+def _lineage(recording: Recording, step: Step) -> str:
+    recorded = (id for _, id in step.consumed if id in recording.messages)
+    return next((recording.envelope(id).lineage for id in recorded), "")
+
+
+def _step_name(key: Key) -> str:
+    stage, handler, lineage, _ = key
+    return f"{stage}.{handler} of {lineage or 'the start'}"

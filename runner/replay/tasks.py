@@ -1,0 +1,273 @@
+"""Executes the steps of one stage again, in the order of its journal, and compares what they emit."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+
+from runner.contract import Message, Tolerances
+from runner.graph.graph import Node
+from runner.graph.ports import Handler
+from runner.inspect.compare import Difference, differences
+from runner.inspect.summary import FieldChange, Summary
+from runner.message.codec import CodecError, Envelope, Step, decode, pack
+from runner.process.step import Arrival, Executor, Log, receive, step_time
+from runner.recording.migrations import without_gained_fields
+from runner.recording.recording import Recording, replicated, split_id, topic_of
+from runner.replay.tolerances import outside
+
+HEADER = tuple(name for name in Envelope.__struct_fields__ if name != "body")
+
+
+class Divergence(msgspec.Struct, frozen=True):
+    """A difference between the recording and the replay."""
+
+    position: int
+    """Of the message in the recording: the lowest comes first."""
+    stage: str
+    replica: int
+    incarnation: int
+    step: int
+    message: str
+    """Id, or what was expected in its place."""
+    difference: str
+
+    def __str__(self) -> str:
+        process = f"{self.stage}[{self.replica}]" + (f" after restart {self.incarnation}" if self.incarnation else "")
+        return f"stage {process}, step {self.step}, message {self.message}: {self.difference}"
+
+
+class Task(msgspec.Struct, frozen=True):
+    """What one process executes again: one incarnation of a stage, or a share of a replicated stage's steps."""
+
+    stage: str
+    incarnation: int
+    share: int = 0
+    shares: int = 1
+
+    def __str__(self) -> str:
+        share = f" ({self.share + 1} of {self.shares})" if self.shares > 1 else ""
+        return self.stage + (f" after restart {self.incarnation}" if self.incarnation else "") + share
+
+
+class Result(msgspec.Struct, frozen=True):
+    """How a task ended."""
+
+    steps: int = 0
+    messages: int = 0
+    seconds: float = 0.0
+    """Processor time inside handlers, which does not depend on what else runs."""
+    startup: float = 0.0
+    """Processor time until the stage was constructed."""
+    within: int = 0
+    """Messages that differ, but no more than tolerances allow."""
+    diverged: int = 0
+    first: Divergence | None = None
+    changes: tuple[FieldChange, ...] = ()
+    failure: str = ""
+    """Why the stage could not be executed at all."""
+
+    def __str__(self) -> str:
+        if self.failure:
+            return f"could not be executed: {self.failure}"
+        words = [f"{self.diverged} DIVERGED"] if self.diverged else []
+        words += [f"{self.within} within tolerances"] if self.within else []
+        counts = f"{self.steps} steps, {self.messages} messages, {self.seconds:.2f} s"
+        return f"{counts}, {', '.join(words) or 'identical'}"
+
+
+def steps_of(recording: Recording, task: Task, node: Node) -> list[Step]:
+    """The steps that a task executes, in order.
+
+    A stage that is stateful has rebuilt its state after each restart, from what its earlier processes had done: one
+    task executes all of it.
+    """
+    steps = [step for step in recording.steps if step.stage == task.stage]
+    if task.stage in replicated(recording.graph):
+        return steps[task.share :: task.shares]
+    if node.type.cls.stateful:
+        last = max((step.incarnation for step in steps), default=0)
+        lasting = (step for step in steps if step.outcome == "done" or step.incarnation == last)
+        return sorted(lasting, key=lambda step: (step.incarnation, step.number))
+    return sorted((step for step in steps if step.incarnation == task.incarnation), key=lambda step: step.number)
+
+
+@dataclass(slots=True)
+class Execution:
+    """What came of one step."""
+
+    step: Step
+    arrivals: list[Arrival] = field(default_factory=list[Arrival])
+    emitted: list[Envelope] = field(default_factory=list[Envelope])
+    error: str = ""
+    """What the handler raised."""
+    refused: str = ""
+    """Why it could not be executed at all."""
+    ended: bool = False
+    """True once the handler has nothing more to emit."""
+
+
+class Reenactment:
+    """A new instance of a stage and the steps it takes again."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        node: Node,
+        steps: Sequence[Step],
+        *,
+        seed: int,
+        directory: Path,
+        log: Log = lambda *_: None,
+    ) -> None:
+        """Constructs the stage; raises Refused where that fails."""
+        self._recording = recording
+        self._node = node
+        self.stage = node.construct()
+        numbers = _first_numbers(steps)
+        self._executor = Executor(node, self.stage, seed=seed, directory=directory, log=log, numbers=numbers)
+        self.seconds = 0.0
+
+    def execute(self, step: Step) -> Execution:
+        """Takes one step; what a handler raises is noted, not raised."""
+        return deque(self.take(step), maxlen=1)[0]
+
+    def take(self, step: Step) -> Iterator[Execution]:
+        """Takes one step message by message: pauses after each, inside the handler, and once more at its end."""
+        done = Execution(step)
+        handler = next((handler for handler in self._node.type.handlers if handler.name == step.handler), None)
+        try:
+            done.arrivals = self._arrivals(step)
+        except CodecError as error:
+            done.refused = f"it cannot be executed: {error}"
+        except KeyError as error:
+            done.refused = f"it cannot be executed: {error.args[0]} is not recorded"
+        if handler is None:
+            done.refused = f"{step.handler}: the stage has no such handler any more"
+        elif not done.refused:
+            for sealed in self._emissions(done, handler):
+                done.emitted.append(sealed)
+                yield done
+        done.ended = True
+        yield done
+
+    def _arrivals(self, step: Step) -> list[Arrival]:
+        arrivals: list[Arrival] = []
+        for port, id in step.consumed:
+            if port not in self._node.type.inputs:
+                raise CodecError(f"input {id}", "", f"the stage has no input {port!r} any more")
+            try:
+                arrivals.append(receive(self._node.type.inputs[port], self._recording.envelope(id)))
+            except CodecError as error:
+                raise CodecError(f"input {id}: {error.type}", error.field, error.reason) from None
+        return arrivals
+
+    def _emissions(self, done: Execution, handler: Handler) -> Iterator[Envelope]:
+        """What the handler emits; a stage that was stopped is not asked for more than it had emitted."""
+        step = done.step
+        time_ns = step_time(self._node, done.arrivals, step.time_ns)
+        wanted = len(step.emitted) if step.outcome == "stopped" else None
+        emissions = itertools.islice(self._executor.run(handler, done.arrivals, time_ns), wanted)
+        while True:
+            began = time.process_time()
+            try:
+                sealed = next(emissions, None)
+            except Exception as error:
+                done.error = f"{type(error).__name__}: {error}"
+                return
+            finally:
+                self.seconds += time.process_time() - began
+            if sealed is None:
+                return
+            yield sealed
+
+
+class Comparison:
+    """Compares what steps emit with what is recorded."""
+
+    def __init__(self, recording: Recording, node: Node, tolerances: Tolerances) -> None:
+        """``tolerances`` is empty where the fingerprint is the recording's."""
+        self._recording = recording
+        self._node = node
+        self._tolerances = tolerances
+        self._positions = {id: position for position, id in enumerate(recording.messages)}
+        self._summary = Summary()
+        self._found: list[Divergence] = []
+        self._steps = self._messages = self._within = 0
+
+    def add(self, done: Execution) -> None:
+        """Compares one step."""
+        self._steps += 1
+        self._found += self._differences(done)
+
+    def result(self, seconds: float, startup: float) -> Result:
+        """What all steps came to."""
+        first = min(self._found, key=lambda divergence: divergence.position, default=None)
+        changes = tuple(self._summary.changes)
+        found = len(self._found)
+        return Result(self._steps, self._messages, seconds, startup, self._within, found, first, changes)
+
+    def _differences(self, done: Execution) -> Iterator[Divergence]:
+        step = done.step
+        if done.refused:
+            yield self._divergence(step, step.emitted[0] if step.emitted else step.handler, done.refused)
+            return
+        for id, sealed in itertools.zip_longest(step.emitted, done.emitted):
+            if id is None:
+                yield self._divergence(step, sealed.id, "emitted in the replay only")
+            elif sealed is None:
+                yield self._divergence(step, id, "recorded, and not emitted in the replay")
+            elif id in self._recording.messages:
+                text = self._compare(id, sealed)
+                if text:
+                    yield self._divergence(step, id, text)
+        if step.outcome != "stopped" and not (step.error.startswith(done.error) if done.error else not step.error):
+            text = f"recorded {step.error or 'no error'!r}, replayed {done.error or 'no error'!r}"
+            yield self._divergence(step, "-", f"error: {text}")
+
+    def _compare(self, id: str, replayed: Envelope) -> str:
+        """Where two messages differ by more than is allowed, or nothing."""
+        self._messages += 1
+        recorded = self._recording.envelope(id)
+        if pack(recorded) == pack(replayed):
+            return ""
+        replayed = without_gained_fields(recorded, replayed)
+        if pack(recorded) == pack(replayed):
+            return ""
+        kind = self._node.type.outputs.get(topic_of(id).partition("/")[2])
+        try:
+            found = list(envelope_differences(kind, recorded, replayed))
+        except CodecError as error:
+            return f"the recorded message cannot be read: {error}"
+        self._summary.add(topic_of(id), id, found)
+        beyond = next(outside(found, self._tolerances), None)
+        if beyond is None and found and self._tolerances:
+            self._within += 1
+            return ""
+        return str(beyond or "the same values in other bytes")
+
+    def _divergence(self, step: Step, message: str, difference: str) -> Divergence:
+        position = self._positions.get(message, len(self._positions))
+        return Divergence(position, step.stage, step.replica, step.incarnation, step.number, message, difference)
+
+
+def envelope_differences(kind: type[Message] | None, recorded: Envelope, replayed: Envelope) -> Iterator[Difference]:
+    """Every difference of two messages, headers first; raises CodecError where a body cannot be read."""
+    for name in HEADER:
+        yield from differences(getattr(recorded, name), getattr(replayed, name), name)
+    if kind is not None and bytes(recorded.body) != bytes(replayed.body):
+        yield from differences(decode(kind, recorded.body), decode(kind, replayed.body))
+
+
+def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:
+    """Where the sequence of each port went on in this incarnation."""
+    numbers: dict[str, int] = {}
+    for id in (id for step in steps for id in step.emitted):
+        numbers.setdefault(topic_of(id).partition("/")[2], split_id(id)[1])
+    return numbers

@@ -1,0 +1,301 @@
+"""Time travel: executes a stage again up to one message, shows it with its causes and opens a prompt with its state."""
+
+from __future__ import annotations
+
+import code
+import importlib
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+
+from runner.contract import Message, Refused, Stage
+from runner.graph.document import suggest
+from runner.graph.graph import SUPERVISOR, Graph
+from runner.inspect.causes import Causes
+from runner.inspect.info import table
+from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
+from runner.process.step import Arrival
+from runner.recording.recording import Recording, replicated, split_id, topic_of
+from runner.replay.expression import Expression
+from runner.replay.tasks import Execution, Reenactment, Task, envelope_differences, steps_of
+from runner.replay.whatif import change
+
+SHOWN = 76
+"""Characters of a value that are shown."""
+DIFFERENCES = 5
+PROMPT = "[Enter] next message, p prompt, q quit > "
+
+
+def travel(
+    path: Path,
+    *,
+    assignments: Sequence[str] = (),
+    swaps: Sequence[str] = (),
+    until: str | None = None,
+    condition: str | None = None,
+    step: bool = False,
+    prompt: bool = False,
+) -> int:
+    """Stops at message ``until``, or where ``condition`` first holds, or with ``step`` at one message after another.
+
+    A Python prompt opens where ``prompt`` says so or the terminal is a person's. Returns 1 where nothing satisfies the
+    condition. Raises Refused for a message, stage or port that does not exist.
+    """
+    recording = Recording(path)
+    recording.require_messages()
+    graph = change(recording, assignments, swaps)
+    start = _start(recording, graph, until, condition)
+    if start is None:
+        print(f"{condition!r} holds for no message of {path}")
+        return 1
+    with tempfile.TemporaryDirectory() as folder:
+        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt or _attended())
+    return 0
+
+
+def _attended() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _start(recording: Recording, graph: Graph, until: str | None, condition: str | None) -> str | None:
+    """The message to stop at; None where the condition never holds."""
+    if until is not None:
+        return _existing(recording, until)
+    if condition is not None:
+        return first_match(recording, graph, condition)
+    return next(iter(recording.messages), None)
+
+
+def _existing(recording: Recording, id: str) -> str:
+    if id in recording.messages:
+        return id
+    port, number = split_id(id)
+    numbers = {split_id(other)[1]: other for other in recording.messages if split_id(other)[0] == port}
+    if not numbers:
+        ports = {split_id(other)[0] for other in recording.messages}
+        raise Refused(f"--until {id}: {recording.path} has no message of {port or id!r}{suggest(port, ports)}")
+    near = sorted(numbers, key=lambda other: (abs(other - number), other))[:3]
+    raise Refused(
+        f"--until {id}: {recording.path} has no such message; the nearest: "
+        f"{', '.join(numbers[other] for other in sorted(near))} (of {port}#{min(numbers)} to #{max(numbers)})"
+    )
+
+
+def first_match(recording: Recording, graph: Graph, condition: str) -> str | None:
+    """The first recorded message after which a condition holds for the newest messages of its lineage."""
+    ports = {name: graph.outputs_of(name) for name in (*graph.nodes, SUPERVISOR)}
+    expression = Expression(condition, ports)
+    newest: dict[str, dict[str, Message]] = defaultdict(dict)
+    for id, located in recording.messages.items():
+        if located.topic in expression.topics:
+            stage, _, port = located.topic.partition("/")
+            sealed = recording.envelope(id)
+            newest[sealed.lineage][located.topic] = _opened(sealed, ports[stage][port])
+            if expression.holds(newest[sealed.lineage]):
+                return id
+    return None
+
+
+def _opened(sealed: Envelope, kind: type[Message]) -> Message:
+    try:
+        return open_envelope(kind, sealed)
+    except CodecError as error:
+        raise Refused(f"{sealed.id} cannot be read: {error}") from None
+
+
+@dataclass(slots=True)
+class Moment:
+    """What there is to see at one message."""
+
+    id: str
+    message: Message | None
+    stage: Stage | None
+    """None for devices, which are not executed."""
+    step: Step | None
+    arrivals: list[Arrival]
+    notes: list[str]
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The messages that the step consumed by port; a list for a gather."""
+        inputs: dict[str, Any] = {}
+        for arrival in self.arrivals:
+            if arrival.port.kind == "gather":
+                inputs.setdefault(arrival.port.name, []).append(arrival.message)
+            else:
+                inputs[arrival.port.name] = arrival.message
+        return inputs
+
+
+class Traveller:
+    """Goes from message to message; stages are constructed when the first of their messages is reached."""
+
+    def __init__(self, recording: Recording, graph: Graph, folder: Path) -> None:
+        self._recording = recording
+        self._graph = graph
+        self._folder = folder
+        self._causes = Causes(recording)
+        self._log: list[str] = []
+        self._lives: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
+        """By stage, replica and incarnation."""
+
+    def go(self, start: str, *, step: bool, prompt: bool) -> None:
+        """Shows a message, with ``step`` the ones after it too for as long as somebody presses Enter."""
+        ids = list(self._recording.messages)
+        for id in ids[ids.index(start) :]:
+            moment = self.moment(id)
+            print("\n".join(described(moment, self._recording)), flush=True)
+            if prompt:
+                self._prompt(moment)
+            if not step or not self._goes_on(moment):
+                return
+            prompt = False
+
+    def moment(self, id: str) -> Moment:
+        """Executes the stage that emitted a message up to it."""
+        step, kind = self._causes.step_of(id), self._kind(id)
+        recorded = self._recording.envelope(id)
+        node = self._graph.nodes.get(id.partition(".")[0])
+        if node is None or node.type.cls.device or step is None:
+            why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
+            return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
+        stage, executions = self._life(step)
+        execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
+        sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
+        message = _opened(sealed, kind) if sealed and kind else None
+        notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
+        return Moment(id, message, stage, step, execution.arrivals, notes)
+
+    def _kind(self, id: str) -> type[Message] | None:
+        stage, port = topic_of(id).split("/")
+        known = stage in self._graph.nodes or stage == SUPERVISOR
+        return self._graph.outputs_of(stage).get(port) if known else None
+
+    def _life(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
+        """The process that took a step, as far as it has been executed again."""
+        node = self._graph.nodes[step.stage]
+        stateful = node.type.cls.stateful
+        life = (step.stage, step.replica, 0 if stateful else step.incarnation)
+        if life not in self._lives:
+            steps = steps_of(self._recording, Task(step.stage, step.incarnation), node)
+            if step.stage in replicated(self._recording.graph):
+                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == life)
+                steps = sorted(mine, key=lambda one: one.number)
+            files = Path(tempfile.mkdtemp(dir=self._folder))
+            again = Reenactment(
+                self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
+            )
+            self._lives[life] = again.stage, self._executions(again, steps)
+        return self._lives[life]
+
+    def _executions(self, again: Reenactment, steps: Sequence[Step]) -> Iterator[Execution]:
+        """All steps of a process, message by message; the log is that of the step at hand."""
+        for step in steps:
+            self._log.clear()
+            yield from again.take(step)
+
+    def _note_log(self, text: str, level: str) -> None:
+        self._log.append(f"{level} of the stage: {text}")
+
+    def _notes(
+        self, done: Execution, recorded: Envelope, sealed: Envelope | None, kind: type[Message] | None
+    ) -> Iterator[str]:
+        if done.refused or done.error:
+            yield done.refused or f"the handler raised {done.error}"
+        if sealed is None:
+            yield "recorded, and not emitted in the replay"
+        elif pack(sealed) == pack(recorded):
+            yield "executed again: identical to the recording"
+        else:
+            found = [str(difference) for difference in envelope_differences(kind, recorded, sealed)]
+            yield f"executed again: {len(found)} fields differ from the recording"
+            yield from found[:DIFFERENCES]
+
+    def _prompt(self, moment: Moment) -> None:
+        """A Python prompt; its end goes on."""
+        names: dict[str, Any] = {
+            "stage": moment.stage,
+            "message": moment.message,
+            "arrivals": moment.inputs,
+            "recording": self._recording,
+        }
+        with suppress(ImportError):
+            importlib.import_module("readline")  # line editing for people
+        with suppress(SystemExit):
+            code.interact(f"{', '.join(names)} are here; Ctrl-D goes on", local=names, exitmsg="")
+
+    def _goes_on(self, moment: Moment) -> bool:
+        while True:
+            try:
+                answer = input(PROMPT).strip()
+            except EOFError:
+                return False
+            if answer != "p":
+                return answer != "q"
+            self._prompt(moment)
+
+
+def _reached(done: Execution, step: Step, id: str) -> bool:
+    """True at the message, and at the end of its step where the message did not come."""
+    at_message = bool(done.emitted) and done.emitted[-1].id == id
+    return at_message or (done.step is step and done.ended)
+
+
+# ------------------------------------------------------------------------------------ for people
+
+
+def described(moment: Moment, recording: Recording) -> Iterator[str]:
+    """A message, what became of it, and its causes, as lines."""
+    sealed = recording.envelope(moment.id)
+    yield f"{moment.id}  {sealed.type}, of {sealed.lineage}"
+    if moment.step is not None:
+        step = moment.step
+        process = f"{step.stage}[{step.replica}]" + (f" after restart {step.incarnation}" if step.incarnation else "")
+        yield f"  step {step.number} of {process}, {step.handler}"
+    yield from (f"  {note}" for note in moment.notes)
+    fields = moment.message.__struct_fields__ if moment.message is not None else ()
+    yield from (f"    {name} = {brief(getattr(moment.message, name))}" for name in fields)
+    if moment.step is not None and moment.step.consumed:
+        yield f"  causes (the whole tree: runner why {moment.id} {recording.path})"
+        yield from (f"    {line}" for line in table(("port", "id", "type"), _causes(moment.step, recording))[1:])
+
+
+def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
+    for port, id in step.consumed:
+        located = recording.messages.get(id)
+        yield port, id, located.type if located else "not recorded"
+
+
+def brief(value: Any) -> str:
+    """A value in one line."""
+    if isinstance(value, np.ndarray):
+        return _brief_array(cast("np.ndarray[Any, Any]", value))
+    if isinstance(value, list | tuple) and value:
+        items = cast("Sequence[Any]", value)
+        if isinstance(items[0], msgspec.Struct | np.ndarray):
+            return f"{len(items)} x {_clipped(brief(items[0]))}"
+    if isinstance(value, msgspec.Struct):
+        fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
+        return _clipped(f"{type(value).__name__}({', '.join(fields)})")
+    return _clipped(repr(value))
+
+
+def _brief_array(array: np.ndarray[Any, Any]) -> str:
+    kind = f"{array.dtype.name} {array.shape}"
+    if array.size == 0:
+        return kind
+    if array.size <= 6:
+        return f"{kind} {np.array2string(array, precision=4, separator=', ').replace(chr(10), '')}"
+    return f"{kind} from {array.min():.4g} to {array.max():.4g}"
+
+
+def _clipped(text: str) -> str:
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."

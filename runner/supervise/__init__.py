@@ -1,0 +1,1 @@
+"""A run: its processes are started, watched, replaced and asked."""

@@ -1,0 +1,268 @@
+"""Commands called from outside: checks them, publishes them, and follows each until the stage has done it."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import itertools
+import textwrap
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import yaml
+
+from runner.contract import Command, Level, Refused
+from runner.graph.document import suggest
+from runner.graph.graph import Graph, Node, command_port
+from runner.graph.ports import port_name
+from runner.message.codec import LogLine, Step
+
+KEPT = 100
+"""Calls that may still be asked about."""
+PATIENCE_SECONDS = 5.0
+"""How long a question about a call waits for news."""
+
+
+class Field(msgspec.Struct, frozen=True):
+    """One field of a command."""
+
+    name: str
+    type: str
+    default: str | None
+    """None where a value must be given."""
+    text: str
+
+
+class CommandType(msgspec.Struct, frozen=True):
+    """What a stage can be asked."""
+
+    stage: str
+    name: str
+    text: str
+    fields: tuple[Field, ...]
+    answers: tuple[str, ...]
+    """Output ports whose next message ends the call."""
+
+
+class CallRequest(msgspec.Struct, frozen=True):
+    """One call as it was typed."""
+
+    stage: str
+    command: str
+    arguments: dict[str, str]
+
+
+class CallQuestion(msgspec.Struct, frozen=True):
+    """Asks how a call goes, beyond the first ``since`` log lines."""
+
+    id: str
+    since: int
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """How a call goes."""
+
+    lines: tuple[tuple[Level, str], ...]
+    """New log lines of the stage."""
+    done: bool
+    refused: str = ""
+    """Why the stage would not do it."""
+    emitted: tuple[str, ...] = ()
+    """Ids of what the step emitted."""
+    answer: bytes = b""
+    """The envelope of the answer, where the command has one."""
+
+
+Publish = Callable[[str, Command, Callable[[str], None]], None]
+"""Sends a command on an output port of the supervisor, and says under which id before it does."""
+
+
+@dataclass(slots=True)
+class _Call:
+    stage: str
+    answers: frozenset[str]
+    """Output ports."""
+    left: set[int]
+    """Replicas that have not done it yet."""
+    lines: list[tuple[Level, str]] = field(default_factory=list[tuple[Level, str]])
+    step: Step | None = None
+    """The step that did it; of replicas, the first."""
+    payload: bytes = b""
+    done: bool = False
+
+
+class Calls:
+    """All calls of one run. The supervisor tells it what it hears."""
+
+    def __init__(self, graph: Graph, publish: Publish) -> None:
+        self._graph = graph
+        self._publish = publish
+        self._calls: OrderedDict[str, _Call] = OrderedDict()
+        self._answers: OrderedDict[str, bytes] = OrderedDict()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    @property
+    def answer_keys(self) -> list[str]:
+        """``STAGE/PORT`` of everything that answers a command."""
+        return sorted({f"{kind.stage}/{answer}" for kind in self.types() for answer in kind.answers})
+
+    def types(self) -> list[CommandType]:
+        """Every command of the graph."""
+        return [kind for node in self._graph.nodes.values() for kind in command_types(node)]
+
+    def call(self, request: CallRequest) -> str:
+        """Publishes a command and returns its id; raises Refused naming the valid ones where it breaks its type."""
+        kind = _find(self._graph, request)
+        command = read_command(f"{request.stage} {request.command}", kind, request.arguments)
+        own, replicas = "", set(range(self._graph.nodes[request.stage].replicas))
+
+        def note(id: str) -> None:
+            nonlocal own
+            own = id
+            with self._changed:
+                self._calls[id] = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
+                while len(self._calls) > KEPT:
+                    self._calls.popitem(last=False)
+
+        self._publish(command_port(request.stage, request.command), command, note)
+        return own
+
+    def progress(self, question: CallQuestion) -> Progress:
+        """Waits for news of a call, but not for long."""
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        with self._changed:
+            call = self._calls.get(question.id)
+            if call is None:
+                raise Refused(f"{question.id}: no such call; the newest {KEPT} are remembered")
+            while not (call.done or len(call.lines) > question.since) and time.monotonic() < deadline:
+                if self._closed:
+                    raise Refused("the graph ended before it was done")
+                self._changed.wait(0.1)
+            error = call.step.error if call.step else ""
+            emitted = call.step.emitted if call.step else ()
+            lines = tuple(call.lines[question.since :])
+            return Progress(lines, call.done, error.removeprefix("Refused: "), emitted, call.payload)
+
+    def note_log(self, line: LogLine) -> None:
+        """Takes a log line; it belongs to every call of its stage that is under way."""
+        with self._changed:
+            for call in self._calls.values():
+                if call.stage == line.stage and not call.done and line.level != "debug":
+                    call.lines.append((line.level, line.text))
+            self._changed.notify_all()
+
+    def note_answer(self, id: str, payload: bytes) -> None:
+        """Takes a message that may answer a call, before the step that emitted it."""
+        with self._changed:
+            self._answers[id] = payload
+            while len(self._answers) > KEPT:
+                self._answers.popitem(last=False)
+
+    def note_step(self, step: Step) -> None:
+        """Takes a step that was done: the one of a command, or a later one that answers it."""
+        with self._changed:
+            consumed = {id for _, id in step.consumed}
+            for id, call in self._calls.items():
+                if call.stage == step.stage and not call.done:
+                    self._advance(id in consumed, call, step)
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Lets everybody who waits know that the graph ends."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _advance(self, own: bool, call: _Call, step: Step) -> None:
+        if own:
+            call.step = call.step or step
+            call.left.discard(step.replica)
+        if call.step is None or call.left:
+            return
+        wanted = {f"{call.stage}.{answer}" for answer in call.answers}
+        answers = [id for id in step.emitted if id.partition("#")[0] in wanted]
+        call.payload = self._answers.get(answers[0], b"") if answers else b""
+        call.done = not call.answers or bool(answers) or bool(call.step.error)
+
+
+# ------------------------------------------------------------------------------------------ types of commands
+
+
+def command_types(node: Node) -> list[CommandType]:
+    """The commands of one stage."""
+    return [_command_type(node, name, kind) for name, kind in node.type.commands.items()]
+
+
+def read_command(place: str, kind: type[Command], arguments: Mapping[str, str]) -> Command:
+    """A command from the texts of its fields; raises Refused naming field, value and what is valid."""
+    infos = {info.name: info for info in msgspec.structs.fields(kind)}
+    for name in arguments:
+        if name not in infos:
+            raise Refused(f"{place}: no field {name!r}{suggest(name, infos)}")
+    missing = [name for name, info in infos.items() if info.required and name not in arguments]
+    if missing:
+        raise Refused(f"{place}: needs {', '.join(f'{name}=...' for name in missing)}")
+    return kind(**{name: _value(place, name, infos[name].type, text) for name, text in arguments.items()})
+
+
+def _find(graph: Graph, request: CallRequest) -> type[Command]:
+    node = graph.nodes.get(request.stage)
+    if node is None:
+        raise Refused(f"no stage {request.stage!r}{suggest(request.stage, graph.nodes)}")
+    kind = node.type.commands.get(request.command)
+    if kind is None:
+        raise Refused(
+            f"{request.stage} has no command {request.command!r}{suggest(request.command, node.type.commands)}"
+        )
+    return kind
+
+
+def _value(place: str, name: str, kind: Any, text: str) -> Any:
+    """The text itself where that fits the type, else what YAML makes of it."""
+    try:
+        return msgspec.convert(text, kind, strict=False)
+    except msgspec.ValidationError as error:
+        reason = str(error).partition(" - at `")[0]
+    try:
+        return msgspec.convert(yaml.safe_load(text), kind)
+    except (msgspec.ValidationError, yaml.YAMLError):
+        raise Refused(f"{place}: {name}={text}: {reason}; valid: {_spelled(kind)}") from None
+
+
+def _command_type(node: Node, name: str, kind: type[Command]) -> CommandType:
+    texts = _field_texts(kind)
+    fields = tuple(
+        Field(info.name, _spelled(info.type), None if info.required else repr(info.default), texts.get(info.name, ""))
+        for info in msgspec.structs.fields(kind)
+    )
+    text = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+    return CommandType(node.name, name, text, fields, tuple(map(port_name, kind.answers)))
+
+
+def _spelled(kind: Any) -> str:
+    """A type as a person would say it: the words of a choice, else its name."""
+    found = msgspec.inspect.type_info(kind)
+    if isinstance(found, msgspec.inspect.LiteralType):
+        return " | ".join(map(str, found.values))
+    return getattr(kind, "__name__", str(kind))
+
+
+def _field_texts(kind: type[Command]) -> dict[str, str]:
+    """The string below each field of a class, which Python itself does not keep."""
+    try:
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    except (OSError, SyntaxError, ValueError):
+        return {}
+    body = tree.body if isinstance(tree, ast.ClassDef) else []
+    return {
+        one.target.id: inspect.cleandoc(two.value.value)
+        for one, two in itertools.pairwise(body)
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)
+        if isinstance(two, ast.Expr) and isinstance(two.value, ast.Constant) and isinstance(two.value.value, str)
+    }

@@ -1,0 +1,293 @@
+"""Looks after the processes of a run: has them started, watches them, replaces what dies and ends them all."""
+
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from runner.contract import Level, Refused, Restarted
+from runner.graph.document import suggest
+from runner.graph.graph import SUPERVISOR
+from runner.hosts.head import Hosts
+from runner.message.codec import Pulse, Step
+from runner.message.packet import RECORDER, Process
+from runner.process.children import DUMP, behind, last_lines
+from runner.process.health import Pulses, Watch
+from runner.process.stage_process import EXIT_REFUSED
+from runner.supervise.child import Child, Progress, end_all
+from runner.supervise.launch import Launcher, Run
+from runner.supervise.status import ProcessStatus, Rates
+from runner.terminal import Terminal
+from runner.transport.bus import Presence
+
+STAGE_GRACE_SECONDS = 2.0
+"""What a stage may take to finish its step before it is killed."""
+RECORDER_GRACE_SECONDS = 30.0
+"""What the recorder may take to write what waits for the disk."""
+TICK_SECONDS = 0.05
+"""Between two looks at the processes."""
+DUMP_SECONDS = 0.5
+"""What a hung process gets to print where it hangs before it is killed."""
+SETTLE_SECONDS = 30.0
+"""How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
+RETIRE_SECONDS = 30.0
+"""What a process that is asked to restart may take for its present step; a killed step is done again."""
+ASKED = "asked to restart"
+SHOWN_LINES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Why the graph ended."""
+
+    code: int
+    reason: str
+
+
+class Guardian:
+    """The processes of one run. It is told what is heard of them, from any thread, and looked after by one thread."""
+
+    def __init__(
+        self,
+        run: Run,
+        hosts: Hosts | None,
+        terminal: Terminal,
+        *,
+        say: Callable[[str, Level], None],
+        announce: Callable[[Restarted], None],
+    ):
+        """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced."""
+        self._run = run
+        self._graph = run.graph
+        self._hosts = hosts
+        self._terminal = terminal
+        self._say = say
+        self._announce = announce
+        self._launch = Launcher(run, hosts)
+        self._children: dict[tuple[str, int], Child] = {}
+        self._recorder: Child | None = None
+        self._viewer: Child | None = None
+        self._progress: dict[str, Progress] = defaultdict(Progress)
+        self._presence = Presence()
+        self._pulses = Pulses()
+        self._rates = Rates()
+        self._settled: set[Process] = set()
+        """Dead processes of which the recorder has everything."""
+        self._absent = set(run.graph.processes())
+        self._was_ready = False
+
+    # ------------------------------------------------------------------------------------------ from start to end
+
+    def start_recorder(self, *, view: bool) -> None:
+        """Starts the recorder and, once that is there, the viewer if wanted."""
+        self._recorder = self._launch.recorder()
+        if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
+            self._viewer = self._launch.viewer()
+            self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
+
+    def start_stages(self) -> None:
+        """Starts every process of the graph."""
+        for stage, replica in self._graph.processes():
+            self._children[stage, replica] = self._start(Process(stage, replica))
+
+    def look(self) -> End | None:
+        """Kills what hangs and replaces what has died; returns why the graph ends where that is not possible."""
+        if self._recorder is not None:
+            self._check(self._recorder)
+            if self._recorder_died():
+                return End(1, f"the recorder {self._recorder.reason()}")
+        for child in list(self._children.values()):
+            if child.handle.poll() is None:
+                self._check(child)
+            elif child.heir is not None:
+                self._succeed(child, *child.heir)
+            elif (end := self._replace(child)) is not None:
+                return end
+        return None if self._hosts is None else self._look_after_hosts(self._hosts)
+
+    def name_the_dead(self) -> None:
+        """Says what died just before the end, and is not replaced."""
+        for child in self._children.values():
+            if child.handle.poll() and child.heir is None:
+                reason = child.reason(self._pulses.of(child.process))
+                self._say(f"{self._name(child.process)} died meanwhile: {reason}", "warning")
+                self._show_output(child)
+
+    def end(self) -> str:
+        """Ends the stages, then the recorder and the viewer, then what they left; returns the recorder's verdict."""
+        end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
+        end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
+        end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
+        if left := self._launch.close():
+            self._say(f"the stages {behind(left)}", "warning")
+        return "" if self._recorder is None else self._recorder.reason()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the recorder has ended, and has written everything."""
+        return self._recorder is not None and self._recorder.handle.returncode == 0
+
+    # ------------------------------------------------------------------------------------------ what is heard
+
+    def note_step(self, step: Step) -> None:
+        """Takes a step that the recorder has."""
+        self._progress[step.stage].note(step)
+
+    def note_pulse(self, pulse: Pulse, arrived_ns: int) -> None:
+        """Takes a sign of life."""
+        self._pulses.note(pulse)
+        self._rates.note(pulse, arrived_ns)
+
+    def note_settled(self, process: Process) -> None:
+        """Takes the recorder's word that it has all that a dead process has sent."""
+        self._settled.add(process)
+
+    def note_presence(self, process: Process, present: bool) -> None:
+        """Takes note of a process that came or went; says when it is ready, and when all are."""
+        self._presence.update(process, present)
+        if not present:
+            return
+        child = self._children.get((process.stage, process.replica))
+        if self._recorder is not None and process == self._recorder.process:
+            self._recorder.announced = True
+        elif child is not None and child.process == process:
+            child.ready_after = time.monotonic() - child.started
+            child.announced = True
+            self._terminal.show(self._name(process), f"ready after {child.ready_after:.1f} s")
+            self._absent.discard((process.stage, process.replica))
+        else:
+            return
+        self._say_when_all_are_ready()
+
+    def _say_when_all_are_ready(self) -> None:
+        if not self._was_ready and not self.awaited():
+            self._was_ready = True
+            self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
+
+    # ------------------------------------------------------------------------------------------ what is asked
+
+    def awaited(self) -> list[str]:
+        """Names of those who must hear what is published and have never been ready, then the recorder; none: ready."""
+        if absent := list(self._absent):  # which another thread may change
+            return sorted(self._run.name_of(*key) for key in absent)
+        return [] if self._presence.wait_for([(RECORDER, 0)], lambda: True) else [RECORDER]
+
+    def restart(self, name: str, ended: Callable[[], bool]) -> str:
+        """Asks one process to finish and waits for its successor; returns what to tell the user.
+
+        Raises Refused where there is no such process, or the graph has ``ended`` meanwhile.
+        """
+        found = {self._run.name_of(*key): key for key in self._graph.processes()}
+        if name not in found:
+            raise Refused(f"no process {name!r}{suggest(name, found)}")
+        old = self._children.get(found[name])
+        if old is None or not old.announced:
+            raise Refused(f"{name} is not ready yet")
+        old.retires_by = time.monotonic() + RETIRE_SECONDS
+        old.handle.send_signal(signal.SIGUSR1)
+        while (new := self._children[found[name]]) is old or not new.announced:
+            if ended():
+                raise Refused(f"the graph ended before {name} was back")
+            time.sleep(TICK_SECONDS)
+        return f"{name} is back: process {new.handle.pid}, ready after {new.ready_after:.1f} s"
+
+    def status(self) -> tuple[ProcessStatus, ...]:
+        """How every process is, the recorder first."""
+        return tuple(map(self._status_of, [*filter(None, [self._recorder]), *list(self._children.values())]))
+
+    def _status_of(self, child: Child) -> ProcessStatus:
+        process = child.process
+        pulse = self._pulses.of(process)
+        state = self._rates.state(process.stage, process.replica) if pulse and child.announced else "starting"
+        return ProcessStatus(
+            stage=process.stage,
+            replica=process.replica,
+            name=self._name(process),
+            state=state if child.handle.poll() is None else "ended",
+            pid=child.handle.pid,
+            restarts=process.incarnation,
+            reason=child.restarted_because,
+            pulse=pulse,
+            cpu=self._rates.cpu(process.stage, process.replica),
+            steps_per_second=self._rates.steps(process.stage, process.replica),
+            sent=self._rates.sent(process.stage, process.replica),
+        )
+
+    # ------------------------------------------------------------------------------------------ care
+
+    def _start(self, process: Process) -> Child:
+        return self._launch.stage(process, self._progress[process.stage])
+
+    def _recorder_died(self) -> bool:
+        return self._recorder is not None and self._recorder.handle.poll() is not None
+
+    def _look_after_hosts(self, hosts: Hosts) -> End | None:
+        """Says who is waited for; ends the graph where one that is needed stays away."""
+        for child in self._children.values():
+            if hosts.waits(child.process):
+                child.started, child.watch = time.monotonic(), Watch(self._graph.nodes[child.process.stage].limits)
+        hosts.remind()
+        reason = hosts.overdue(self._graph.hosts_of_stages())
+        return None if reason is None else End(1, reason)
+
+    def _check(self, child: Child) -> None:
+        """Kills a process that hangs or has grown too large, after it has said where it is."""
+        now, name = time.monotonic(), self._name(child.process)
+        change = child.watch.look(now, self._pulses.of(child.process), ready=child.announced)
+        if change:
+            self._say(f"{name} {change}", "warning")
+        if not child.condemned and (fault := child.watch.fault()):
+            child.condemned, child.dies_at = fault, now + DUMP_SECONDS
+            self._say(f"{name} is killed: {fault}", "warning")
+            child.handle.send_signal(DUMP)
+        if now > min(child.dies_at, child.retires_by or child.dies_at):
+            child.handle.send_signal(signal.SIGKILL)
+
+    def _replace(self, child: Child) -> End | None:
+        """Has a dead process replaced within its budget; otherwise says why the graph ends."""
+        process, name = child.process, self._name(child.process)
+        reason = child.reason(self._pulses.of(process))
+        if child.handle.returncode == EXIT_REFUSED:
+            return End(EXIT_REFUSED, f"{name}: {reason}")
+        if child.retires_by is not None and not child.condemned:
+            self._say(f"{name} was {ASKED}", "info")
+            self._mourn(child, ASKED, child.crashes)
+            return None
+        absent, budget = (process.stage, process.replica) in self._absent, self._budget(process.stage)
+        if absent or child.crashes >= budget:
+            self._show_output(child)
+            return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
+        self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")
+        self._show_output(child)
+        self._mourn(child, reason, child.crashes + 1)
+        return None
+
+    def _budget(self, stage: str) -> int:
+        """How often a process may crash. What a stage remembers is rebuilt from recorded messages, if there are any."""
+        forgets = self._run.steps_only and self._run.remembers(stage)
+        return 0 if forgets else self._graph.nodes[stage].restarts
+
+    def _mourn(self, child: Child, reason: str, crashes: int) -> None:
+        """Tells everybody that a process is replaced. What it leaves behind must be known first."""
+        child.heir, child.dies_at = (reason, crashes), time.monotonic()
+        self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
+        if left := self._launch.end_rest(child.process):
+            self._say(f"{self._name(child.process)} {behind(left)}", "warning")
+
+    def _succeed(self, child: Child, reason: str, crashes: int) -> None:
+        """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
+        process = child.process
+        waits = child.announced and process not in self._settled
+        if waits and time.monotonic() < child.dies_at + SETTLE_SECONDS:
+            return
+        successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
+        successor.restarted_because, successor.crashes = reason, crashes
+        self._children[process.stage, process.replica] = successor
+
+    def _show_output(self, child: Child) -> None:
+        for line in last_lines(child.log, SHOWN_LINES, child.log_from):
+            self._terminal.show(self._name(child.process), f"| {line}", "error")
+
+    def _name(self, process: Process) -> str:
+        return self._run.name_of(process.stage, process.replica)

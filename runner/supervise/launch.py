@@ -1,0 +1,149 @@
+"""Starts the processes of a run, each with its task and where it belongs: the recorder, the viewer and the stages."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.graph.placement import Network
+from runner.hosts.head import Hosts
+from runner.message.packet import RECORDER, Process
+from runner.process.children import Family, spawn
+from runner.process.health import Watch
+from runner.process.stage_process import Assignment
+from runner.recording.writer import Manifest, topic
+from runner.supervise.child import Child, Progress
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What is the same for all processes of a run, from its first to its last."""
+
+    id: str
+    graph: Graph
+    recording: Path
+    """The file that the recorder writes."""
+    settings: tuple[str, ...]
+    """``--set`` assignments, as typed."""
+    endpoint: str
+    network: Network | None
+    """None on loopback."""
+    secret: str
+    steps_only: bool
+    """Record no messages."""
+    awaited: tuple[str, ...]
+    """Topics that the recorder passes on to the supervisor."""
+
+    @property
+    def directory(self) -> Path:
+        """The run's folder, beside its recording."""
+        return self.recording.with_suffix("")
+
+    def log_of(self, stage: str, replica: int) -> Path:
+        """Where a process and its successors print."""
+        return self.directory / "log" / f"{stage}-{replica}.txt"
+
+    def name_of(self, stage: str, replica: int) -> str:
+        """A process as people know it: with the replica's number where there are several."""
+        node = self.graph.nodes.get(stage)
+        return f"{stage}.{replica}" if node is not None and node.replicated else stage
+
+    def remembers(self, stage: str) -> bool:
+        """Whether a successor must learn from the recording what its predecessor knew."""
+        kind = self.graph.nodes[stage].type.cls
+        return kind.stateful and not kind.device
+
+    def recorded(self, stage: str) -> frozenset[str]:
+        """Output ports of which the recorder gets every message."""
+        ports = frozenset(self.graph.outputs_of(stage))
+        return ports & {topic.partition("/")[2] for topic in self.awaited} if self.steps_only else ports
+
+
+class Launcher:
+    """Starts single processes of one run, here or on the host that the graph names."""
+
+    def __init__(self, run: Run, hosts: Hosts | None):
+        """``hosts`` are the other machines of the run, None where there are none."""
+        self._run = run
+        self._hosts = hosts
+        self._family = Family()
+
+    def recorder(self) -> Child:
+        """Starts what writes the recording."""
+        run = self._run
+        topics = {
+            f"{stage}/{port}": topic(kind)
+            for stage in (*run.graph.nodes, SUPERVISOR)
+            for port, kind in run.graph.outputs_of(stage).items()
+        }
+        task = Manifest(
+            run.id,
+            run.endpoint,
+            str(run.recording),
+            graph_to_json(run.graph),
+            run.settings,
+            topics,
+            network=run.network,
+            secret=run.secret,
+            steps_only=run.steps_only,
+            awaited=run.awaited,
+        )
+        return self._spawn(Process(RECORDER, 0), "runner.process.recorder", msgspec.json.encode(task))
+
+    def viewer(self) -> Child:
+        """Starts the viewer on the recording as it grows."""
+        log = self._run.directory / "log" / "viewer.txt"
+        process = Process("viewer", 0)
+        mark = self._family.mark(process.path)
+        handle = spawn("runner.cli", "view", "--live", str(self._run.recording), task=b"", log=log, mark=mark)
+        return Child(process, handle, log)
+
+    def stage(self, process: Process, progress: Progress) -> Child:
+        """Starts a process of the graph; ``progress`` is how far its stage has come before."""
+        task, limits = self._assignment(process, progress), self._run.graph.nodes[process.stage].limits
+        host = self._run.graph.host_of(process.stage, process.replica)
+        if self._hosts is not None and host is not None and host != self._hosts.network.host:
+            log = self._run.log_of(process.stage, process.replica)
+            child = Child(process, self._hosts.start(host, process, task, log), log)
+        else:
+            mark = self._family.mark(process.path)
+            child = self._spawn(process, "runner.process.stage_process", msgspec.json.encode(task), mark)
+        child.watch = Watch(limits)
+        return child
+
+    def _assignment(self, process: Process, progress: Progress) -> Assignment:
+        run = self._run
+        relives = process.incarnation > 0 and run.remembers(process.stage)
+        return Assignment(
+            run=run.id,
+            endpoint=run.endpoint,
+            directory=str(run.directory.absolute()),
+            stage=process.stage,
+            entry=node_entry(run.graph.nodes[process.stage]),
+            seed=run.graph.seed,
+            routes=tuple(run.graph.routes(process.stage)),
+            processes=tuple(run.graph.processes()),
+            replica=process.replica,
+            incarnation=process.incarnation,
+            numbers=progress.numbers,
+            started=progress.started,
+            consumed=tuple(progress.consumed),
+            recorded=run.recorded(process.stage),
+            network=run.network,
+            secret=run.secret,
+            past=str(run.recording.absolute()) if relives else "",
+        )
+
+    def end_rest(self, process: Process) -> list[str]:
+        """Ends what a stage's process that has gone has left behind here; returns the command lines."""
+        return self._family.end(process.path)
+
+    def close(self) -> list[str]:
+        """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
+        return self._family.close()
+
+    def _spawn(self, process: Process, module: str, task: bytes, mark: str = "") -> Child:
+        log = self._run.log_of(process.stage, process.replica)
+        log_from = log.stat().st_size if log.exists() else 0
+        return Child(process, spawn(module, task=task, log=log, mark=mark), log, log_from=log_from)

@@ -1,0 +1,113 @@
+"""The runs of this user on this machine: a file each, locked by its supervisor for as long as that lives."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+from runner.contract import Refused
+from runner.graph.placement import Network
+from runner.recording.container import hold, is_being_written
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """What the live tools must know to reach a run."""
+
+    run: str
+    endpoint: str
+    pid: int
+    """Of the supervisor."""
+    graph: str
+    """Path of the graph file."""
+    recording: str
+    """Path of the file that is being written."""
+    started: float
+    """Seconds since the epoch."""
+    secret: str = ""
+    """What those who ask show that they may: only this user can read it."""
+    network: Network | None = None
+    """What the run's network asks of its peers; None on loopback."""
+
+
+class Registration:
+    """Lists a run until it is closed, or its process dies."""
+
+    def __init__(self, entry: Entry, folder: Path | None = None) -> None:
+        """Raises Refused where the folder cannot be made or is not this user's alone."""
+        self._path = (folder or registry_folder()) / f"{entry.run}.json"
+        unlisted = self._path.with_suffix(f".{os.getpid()}")
+        self._file: IO[bytes] = unlisted.open("wb")
+        hold(self._file)
+        self._file.write(msgspec.json.format(msgspec.json.encode(entry)))
+        self._file.flush()
+        try:
+            self._path.hardlink_to(unlisted)
+        except FileExistsError:
+            self._file.close()
+            raise Refused(f"{entry.run}: another run of that name lives") from None
+        finally:
+            unlisted.unlink()
+
+    def close(self) -> None:
+        """Strikes the run off the list."""
+        self._path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def registry_folder() -> Path:
+    """The folder of the entries; raises Refused where others could write to it."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    usable = bool(runtime) and os.access(runtime, os.W_OK | os.X_OK)  # another user's after `su`, or gone
+    folder = Path(runtime) / "runner" if usable else Path(f"/tmp/runner-{os.getuid()}")
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise Refused(f"{folder}: the list of runs cannot be kept there: {error.strerror}") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise Refused(f"{folder}: must be a folder that only this user may enter; type: rm -rf {folder}")
+    return folder
+
+
+def runs(folder: Path | None = None) -> list[Entry]:
+    """Every run that lives, oldest first; what dead ones have left is cleaned up."""
+    found = [_read(path) for path in sorted((folder or registry_folder()).iterdir())]
+    return sorted((entry for entry in found if entry is not None), key=lambda entry: entry.started)
+
+
+def find_run(name: str | None = None, folder: Path | None = None) -> Entry:
+    """The run of that name (or the only one whose name begins so), or the only run there is."""
+    living = runs(folder)
+    exact = [entry for entry in living if entry.run == name]
+    fitting = exact or [entry for entry in living if name is None or entry.run.startswith(name)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not living:
+        raise Refused("no graph is running on this machine; start one: runner up GRAPH")
+    listed = ", ".join(entry.run for entry in fitting or living)
+    if not fitting:
+        raise Refused(f"--run {name}: no such run; valid: {listed}")
+    raise Refused(f"{len(fitting)} graphs are running: choose one with --run; valid: {listed}")
+
+
+def is_alive(entry: Entry, folder: Path | None = None) -> bool:
+    """Whether a run is still listed by a supervisor that lives."""
+    return any(other.run == entry.run for other in runs(folder))
+
+
+def _read(path: Path) -> Entry | None:
+    """One entry, or None where its supervisor has died; its file is removed then."""
+    if path.suffix != ".json":
+        return None
+    try:
+        with path.open("rb") as file:
+            if is_being_written(file):
+                return msgspec.json.decode(file.read(), type=Entry)
+        path.unlink(missing_ok=True)
+    except (OSError, msgspec.MsgspecError):
+        pass
+    return None

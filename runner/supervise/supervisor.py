@@ -1,0 +1,304 @@
+"""Runs a graph: hears its processes, speaks and answers for the run, and ends everything together."""
+
+import contextlib
+import itertools
+import os
+import queue
+import secrets
+import signal
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from runner.contract import Finished, Level, Message, Refused, Restarted
+from runner.graph.graph import FINISHED, SUPERVISOR, Graph
+from runner.graph.placement import ALONE
+from runner.graph.ports import port_name
+from runner.hosts.head import Hosts
+from runner.inspect.info import stage_times
+from runner.inspect.skipped import skipped
+from runner.message import codec
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step
+from runner.message.packet import RECORDER, Packet, Process
+from runner.message.refusals import Refusals, admit, require_genuine
+from runner.process.delivery import Delivery
+from runner.supervise.calls import CallQuestion, CallRequest, Calls
+from runner.supervise.guardian import TICK_SECONDS, End, Guardian
+from runner.supervise.launch import Run
+from runner.supervise.registry import Entry, Registration, runs
+from runner.supervise.status import RunStatus, topics_of
+from runner.terminal import Terminal
+from runner.transport.bus import Bus
+from runner.transport.session import free_endpoint
+
+EXIT_INCOMPLETE = 3
+
+
+class Supervisor:
+    """One run of a graph."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        *,
+        file: Path,
+        recordings: Path,
+        settings: tuple[str, ...],
+        terminal: Terminal,
+        steps_only: bool = False,
+    ):
+        """Makes the folder of the run and lists it; raises Refused where that is not possible.
+
+        ``file`` is where the graph was read from. Where it names hosts, this machine is the head. With ``steps_only``
+        no messages are recorded.
+        """
+        self._graph = graph
+        self._terminal = terminal
+        self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
+        self._calls = Calls(graph, self._publish)
+        id, recording = _new_recording(recordings, graph.name)
+        self._run = run = Run(
+            id,
+            graph,
+            recording,
+            settings,
+            endpoint=self._hosts.endpoint if self._hosts else free_endpoint(),
+            network=self._hosts.network if self._hosts else None,
+            secret=secrets.token_hex(16),
+            steps_only=steps_only,
+            awaited=tuple(self._awaited()),
+        )
+        listen, connect = (self._hosts.listen(), run.endpoint) if self._hosts else (run.endpoint, None)
+        own = Process(SUPERVISOR, 0)
+        self._bus = Bus(run.id, listen=listen, connect=connect, network=run.network, secret=run.secret, process=own)
+        self._entry = Entry(
+            run=run.id,
+            endpoint=listen or run.endpoint,
+            pid=os.getpid(),
+            graph=str(file.absolute()),
+            recording=str(run.recording.absolute()),
+            started=time.time(),
+            secret=run.secret,
+            network=run.network,
+        )
+        self._registration = Registration(self._entry)
+        self._stopping = threading.Event()
+        self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.deliver, self._warn, self._stopping.is_set)
+        self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
+        self._steps: list[Step] = []
+        self._refusals = Refusals(self._complain)
+        self._guardian = Guardian(run, self._hosts, terminal, say=self._say, announce=self._publish_restart)
+        self._numbers: dict[str, int] = defaultdict(int)
+        """Next sequence number by output port of the supervisor."""
+        self._numbering = threading.Lock()
+
+    def run(self, *, view: bool = False) -> End:
+        """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
+                signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
+        self._connect()
+        self._terminal.show(SUPERVISOR, f"run {self._run.id} on {self._run.endpoint}")
+        try:
+            self._guardian.start_recorder(view=view)
+            if self._hosts is not None:
+                self._hosts.open(self._run.id, self._run.recording)
+            self._guardian.start_stages()
+            end = self._watch()
+        finally:
+            verdict = self._stop()
+        return self._dismiss(self._conclude(end, verdict))
+
+    def _watch(self) -> End:
+        """Waits for the end, and has looked after the processes meanwhile."""
+        while True:
+            with contextlib.suppress(queue.Empty):
+                end = self._events.get(timeout=TICK_SECONDS)
+                self._guardian.name_the_dead()
+                return end
+            end = self._guardian.look()
+            if end is not None:
+                return end
+
+    # ------------------------------------------------------------------------------------------ what is heard
+
+    def _connect(self) -> None:
+        for consumer in {route.consumer for route in self._graph.routes(SUPERVISOR)}:
+            self._bus.subscribe(f"r/{consumer}", self._on_receipt)
+        self._bus.subscribe("j/*", self._on_journal)
+        self._bus.subscribe("l/*", self._on_log)
+        self._bus.subscribe(f"a/*/{FINISHED}", self._on_finished)
+        self._bus.subscribe("gone/**", self._on_gone)
+        self._bus.subscribe("h/**", self._on_pulse)
+        for key in self._calls.answer_keys:
+            self._bus.subscribe(f"a/{key}", self._on_answer)
+        self._serve()
+        self._bus.watch(self._on_presence, self._refusals.refuse)
+
+    def _awaited(self) -> Iterator[str]:
+        """Topics that are passed on to here: the end, and answers to calls."""
+        for stage in self._graph.nodes:
+            if FINISHED in self._graph.outputs_of(stage):
+                yield f"{stage}/{FINISHED}"
+        yield from self._calls.answer_keys
+
+    def _on_journal(self, packet: Packet) -> None:
+        journal = self._refusals.read(Journal, packet)
+        for step in journal.steps if journal is not None else ():
+            self._guardian.note_step(step)
+            self._steps.append(step)
+            if step.outcome == "done":
+                self._delivery.acknowledge(step.stage, step.consumed)
+                self._calls.note_step(step)
+
+    def _on_answer(self, packet: Packet) -> None:
+        envelope = self._refusals.read(Envelope, packet)
+        if envelope is not None:
+            self._calls.note_answer(envelope.id, bytes(packet.payload))
+
+    def _on_receipt(self, packet: Packet) -> None:
+        receipt = self._refusals.read(Receipt, packet)
+        if receipt is not None and receipt.consumed:
+            self._delivery.acknowledge(packet.end, [(receipt.port, receipt.id)])
+
+    def _on_log(self, packet: Packet) -> None:
+        line = self._refusals.read(LogLine, packet)
+        if line is not None:
+            self._calls.note_log(line)
+            if line.stage != SUPERVISOR and line.level != "debug":
+                self._terminal.show(self._run.name_of(line.stage, line.replica), line.text, line.level)
+
+    def _on_finished(self, packet: Packet) -> None:
+        try:
+            finished = codec.open_envelope(Finished, admit(Envelope, packet))
+        except CodecError as error:
+            self._refusals.refuse(packet.key, error)
+        else:
+            self._events.put(End(finished.code, finished.reason))
+
+    def _on_gone(self, packet: Packet) -> None:
+        try:
+            require_genuine(packet)
+            self._guardian.note_settled(Process.of(packet.key))
+        except (CodecError, Refused) as error:
+            self._refusals.refuse(packet.key, error)
+
+    def _on_pulse(self, packet: Packet) -> None:
+        pulse = self._refusals.read(Pulse, packet)
+        if pulse is not None:
+            self._guardian.note_pulse(pulse, packet.arrived_ns)
+
+    def _on_presence(self, process: Process, present: bool) -> None:
+        self._delivery.update(process, present)
+        self._guardian.note_presence(process, present)
+
+    # ------------------------------------------------------------------------------------------ what is published
+
+    def _publish_restart(self, restarted: Restarted) -> None:
+        self._publish(port_name(Restarted), restarted)
+
+    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> None:
+        """Sends a message of the supervisor's own; ``say`` is told its id before anybody else."""
+        with self._numbering:
+            own = f"{SUPERVISOR}.{port}#{self._numbers[port]}"
+            self._numbers[port] += 1
+        say(own)
+        envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
+        payload = codec.pack(envelope)
+        self._bus.deliver((RECORDER, 0), f"m/{SUPERVISOR}/{port}", payload)
+        self._delivery.publish(port, envelope, payload)
+
+    # ------------------------------------------------------------------------------------------ the end
+
+    def _stop(self) -> str:
+        """Ends all processes and what connects them, and returns the recorder's verdict."""
+        self._stopping.set()
+        self._calls.close()
+        verdict = self._guardian.end()
+        self._bus.close()
+        self._registration.close()
+        return verdict
+
+    def _conclude(self, end: End, verdict: str) -> End:
+        if self._steps:
+            self._terminal.plain("", *stage_times(self._steps), *skipped(self._graph, self._steps), "")
+        self._terminal.plain(f"recording {verdict}")
+        return end if self._guardian.complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
+
+    def _dismiss(self, end: End) -> End:
+        """Tells the other hosts how it ended."""
+        if self._hosts is not None:
+            self._hosts.close(end.code, end.reason)
+        return end
+
+    # ------------------------------------------------------------------------------------------ what is asked
+
+    def _serve(self) -> None:
+        """Answers the live tools."""
+        serve = self._bus.serve
+        serve("status", lambda _: msgspec.json.encode(self._status()))
+        serve("commands", lambda _: msgspec.json.encode(self._calls.types()))
+        serve("call", lambda text: self._call(msgspec.json.decode(text, type=CallRequest)).encode())
+        serve(
+            "progress",
+            lambda text: msgspec.json.encode(self._calls.progress(msgspec.json.decode(text, type=CallQuestion))),
+        )
+        serve("restart", lambda text: self._guardian.restart(text.decode(), self._stopping.is_set).encode())
+        serve("down", self._down)
+
+    def _down(self, _: bytes) -> bytes:
+        self._events.put(End(0, "ended by runner down"))
+        return b""
+
+    def _call(self, request: CallRequest) -> str:
+        if awaited := self._guardian.awaited():
+            raise Refused(f"the graph is not ready yet: it waits for {', '.join(awaited)}")
+        return self._calls.call(request)
+
+    def _status(self) -> RunStatus:
+        return RunStatus(
+            run=self._run.id,
+            graph=self._entry.graph,
+            recording=self._entry.recording,
+            endpoint=self._run.endpoint,
+            started=self._entry.started,
+            ready=not self._guardian.awaited(),
+            processes=self._guardian.status(),
+            topics=topics_of(self._graph),
+            published={f"{SUPERVISOR}/{port}": number for port, number in list(self._numbers.items())},
+        )
+
+    # ------------------------------------------------------------------------------------------ what is said
+
+    def _say(self, text: str, level: Level) -> None:
+        self._terminal.show(SUPERVISOR, text, level)
+        line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
+        self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
+
+    def _complain(self, text: str) -> None:
+        self._say(text, "error")
+
+    def _warn(self, text: str) -> None:
+        self._say(text, "warning")
+
+
+def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
+    """A run id that is not taken and its recording; its folder is made."""
+    base = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    taken = {entry.run for entry in runs()}
+    for attempt in itertools.count():
+        run = f"{base}-{attempt}" if attempt else base
+        if run in taken:
+            continue
+        try:
+            (folder / run / "log").mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise Refused(f"{folder / run}: {error.strerror}") from None
+        return run, folder / f"{run}.mcap"
+    raise AssertionError

@@ -1,0 +1,1 @@
+"""Zenoh: sessions, keys and who may take part."""

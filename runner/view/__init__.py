@@ -1,0 +1,1 @@
+"""Messages as drawings, shown in Rerun or exported."""

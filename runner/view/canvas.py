@@ -1,0 +1,206 @@
+"""Puts neutral drawings and layouts onto a Rerun recording stream."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from runner.view import drawing as d
+
+STEP = "step"
+TIME = "time"
+
+
+class Canvas:
+    """One Rerun stream with a ``step`` timeline (one step per message or animation frame) and the logical ``time``."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self.stream = stream
+        self._step = -1
+
+    def start(self, layout: d.Layout, static: Iterable[d.Drawing]) -> None:
+        """Sends the arrangement of the panels and what never changes."""
+        self.stream.send_blueprint(blueprint(layout), make_active=True, make_default=True)
+        for drawing in static:
+            self._put(drawing, static=True)
+
+    def show(self, drawings: Iterable[d.Drawing], *, time_ns: int) -> None:
+        """Draws on a new step at logical time ``time_ns``; messages without a drawing take no step."""
+        fresh = True
+        for drawing in drawings:
+            if fresh or isinstance(drawing, d.NextStep):
+                self._advance(time_ns)
+                fresh = False
+            if not isinstance(drawing, d.NextStep):
+                self._put(drawing)
+
+    def _advance(self, time_ns: int) -> None:
+        self._step += 1
+        self.stream.set_time(STEP, sequence=self._step)
+        self.stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
+
+    def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
+        for path, archetype in _ARCHETYPES[type(drawing)](drawing):
+            self.stream.log(path, archetype, static=static)
+
+
+Logged = Iterable[tuple[str, Any]]
+
+
+def _image(image: d.Image) -> Logged:
+    overlay = image.opacity < 1 or image.rgb.shape[2] == 4
+    yield image.path, rr.Image(image.rgb, opacity=image.opacity, draw_order=-5 if overlay else -10)
+
+
+def _depth(depth: d.DepthImage) -> Logged:
+    seen = depth.depth[depth.depth > 0]
+    lowest = depth.nearest if depth.nearest is not None else float(seen.min(initial=np.inf))
+    highest = depth.farthest if depth.farthest is not None else float(seen.max(initial=0.0))
+    extent = (lowest, highest) if lowest < highest else (0.0, 1.0)
+    yield depth.path, rr.DepthImage(depth.depth, meter=1.0, colormap="turbo", depth_range=extent)
+
+
+def _boxes(boxes: d.Boxes2D) -> Logged:
+    yield (
+        boxes.path,
+        rr.Boxes2D(
+            array=np.asarray(boxes.boxes, dtype=np.float64).reshape(-1, 4),
+            array_format=rr.Box2DFormat.XYXY,
+            labels=boxes.labels or None,
+            colors=boxes.colors or None,
+        ),
+    )
+
+
+def _pinhole(camera: d.Pinhole) -> Logged:
+    yield (
+        camera.path,
+        rr.Pinhole(
+            image_from_camera=camera.K,
+            resolution=(camera.width, camera.height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.3,
+        ),
+    )
+
+
+def _transform(transform: d.Transform) -> Logged:
+    yield transform.path, rr.Transform3D(translation=transform.T[:3, 3], mat3x3=transform.T[:3, :3])
+
+
+def _mesh(mesh: d.Mesh3D) -> Logged:
+    one = isinstance(mesh.colors, tuple)
+    yield (
+        mesh.path,
+        rr.Mesh3D(
+            vertex_positions=mesh.vertices,
+            triangle_indices=mesh.faces,
+            vertex_normals=_normals(np.asarray(mesh.vertices, np.float64), mesh.faces),
+            vertex_colors=None if one else mesh.colors,
+            albedo_factor=mesh.colors if one else None,
+        ),
+    )
+
+
+def _normals(vertices: d.Floats, faces: NDArray[np.integer[Any]]) -> d.Floats:
+    """Area-weighted vertex normals, V x 3; without them the viewer draws a mesh unlit."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.zeros_like(vertices)
+    for corner in faces.T:
+        np.add.at(normals, corner, np.cross(b - a, c - a))
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(lengths > 0, lengths, 1)
+
+
+def _points(points: d.Points3D) -> Logged:
+    yield points.path, rr.Points3D(points.positions, colors=points.colors, radii=points.radius)
+
+
+def _lines(lines: d.Lines3D) -> Logged:
+    yield lines.path, rr.LineStrips3D(list(lines.strips), colors=lines.color, radii=lines.radius)
+
+
+def _text(text: d.Text) -> Logged:
+    yield text.path, rr.TextDocument(text.markdown, media_type=rr.MediaType.MARKDOWN)
+
+
+def _graph(graph: d.Graph) -> Logged:
+    nodes = rr.GraphNodes(graph.nodes, labels=graph.labels, colors=graph.colors or None, positions=graph.positions)
+    yield graph.path, nodes
+    yield graph.path, rr.GraphEdges(graph.edges, graph_type="directed")
+
+
+def _scalar(scalar: d.Scalar) -> Logged:
+    yield scalar.path, rr.SeriesLines(names=scalar.name or scalar.path.rpartition("/")[2])
+    yield scalar.path, rr.Scalars(scalar.value)
+
+
+def _bars(bars: d.BarChart) -> Logged:
+    yield bars.path, rr.BarChart(bars.values, color=bars.color)
+
+
+def _clear(clear: d.Clear) -> Logged:
+    yield clear.path, rr.Clear(recursive=True)
+
+
+_ARCHETYPES: dict[type, Callable[[Any], Logged]] = {
+    d.Image: _image,
+    d.DepthImage: _depth,
+    d.Boxes2D: _boxes,
+    d.Pinhole: _pinhole,
+    d.Transform: _transform,
+    d.Mesh3D: _mesh,
+    d.Points3D: _points,
+    d.Lines3D: _lines,
+    d.Text: _text,
+    d.Graph: _graph,
+    d.Scalar: _scalar,
+    d.BarChart: _bars,
+    d.Clear: _clear,
+}
+
+_PANELS: dict[d.PanelKind, Callable[..., Any]] = {
+    "image": rrb.Spatial2DView,
+    "space": rrb.Spatial3DView,
+    "graph": rrb.GraphView,
+    "text": rrb.TextDocumentView,
+    "bars": rrb.BarChartView,
+    "series": rrb.TimeSeriesView,
+}
+
+
+def blueprint(layout: d.Layout) -> rrb.Blueprint:
+    """The layout as a Rerun blueprint that follows the ``step`` timeline, with the side panels folded away."""
+    return rrb.Blueprint(
+        _part(layout),
+        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+        collapse_panels=True,
+    )
+
+
+def _part(layout: d.Layout) -> Any:
+    match layout:
+        case d.Panel():
+            return _panel(layout)
+        case d.Row(parts, shares):
+            return rrb.Horizontal(*map(_part, parts), column_shares=shares or None)
+        case d.Column(parts, shares):
+            return rrb.Vertical(*map(_part, parts), row_shares=shares or None)
+        case d.Tabs(parts):
+            return rrb.Tabs(*map(_part, parts))
+
+
+def _panel(panel: d.Panel) -> Any:
+    options: dict[str, Any] = {}
+    if panel.contents:
+        options["contents"] = list(panel.contents)
+    if panel.eye is not None:
+        options["eye_controls"] = rrb.EyeControls3D(position=panel.eye, look_target=panel.target, eye_up=(0, 0, 1))
+    return _PANELS[panel.kind](origin=f"/{panel.origin.strip('/')}", name=panel.name, **options)

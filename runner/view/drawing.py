@@ -1,0 +1,258 @@
+"""What a view shows, in neutral terms: drawings and a layout, mapped to a viewer by :mod:`runner.view.rerun_view`.
+
+A graph file names a class (``view: stages.views:Views``) that turns messages into drawings; it is the
+:class:`Views` protocol below. Drawings are values and know nothing of the viewer.
+
+Paths are entity paths with slashes (``"camera/rgb"``). A drawing replaces what stood at its path before,
+from the current step on. Three-dimensional drawings live in the frame of the nearest :class:`Transform`
+above them: ``Transform("world/cup", T)`` moves ``Mesh3D("world/cup/mesh", ...)``. Lengths are metres,
+pixels are OpenCV's (pixel centres at integer coordinates), colours are sRGB bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.contract import Message
+
+Floats = NDArray[np.floating[Any]]
+Bytes = NDArray[np.uint8]
+Color = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A colour image. Images below one path are laid over each other; a lower ``opacity`` lets the other show."""
+
+    path: str
+    rgb: Bytes
+    """H x W x 3, or H x W x 4 with an alpha channel (0 is transparent)."""
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """A depth image, coloured by distance. Below a :class:`Pinhole` it also becomes a point cloud in space."""
+
+    path: str
+    depth: Floats
+    """H x W, metres along the optical axis, 0 where there is no reading."""
+    nearest: float | None = None
+    """Metres of the colour map's ends; the image's own extremes by default."""
+    farthest: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes2D:
+    """Axis-aligned boxes over an image, each with a label."""
+
+    path: str
+    boxes: Floats
+    """N x 4: x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""
+    labels: tuple[str, ...] = ()
+    colors: tuple[Color, ...] = ()
+    """One per box, or none for the viewer's choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """Makes ``path`` a camera: what lies below it is its image; z forward, x right, y down."""
+
+    path: str
+    K: Floats
+    """3 x 3, pixels."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Places ``path`` and everything below it in the frame above."""
+
+    path: str
+    T: Floats
+    """4 x 4, ``T_parent_path``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh3D:
+    """Triangles in the frame of ``path``."""
+
+    path: str
+    vertices: Floats
+    """V x 3, metres."""
+    faces: NDArray[np.integer[Any]]
+    """F x 3, counter-clockwise seen from outside."""
+    colors: Bytes | Color | None = None
+    """V x 3, or one colour for all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points3D:
+    """Points in the frame of ``path``."""
+
+    path: str
+    positions: Floats
+    """N x 3, metres."""
+    colors: Bytes | Color | None = None
+    """N x 3, or one colour for all."""
+    radius: float = 0.003
+    """Metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lines3D:
+    """Polylines in the frame of ``path``."""
+
+    path: str
+    strips: tuple[Floats, ...]
+    """Each N x 3, metres."""
+    color: Color | None = None
+    radius: float = 0.002
+    """Metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A page of Markdown."""
+
+    path: str
+    markdown: str
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A graph of labelled nodes."""
+
+    path: str
+    nodes: tuple[str, ...]
+    """Unique names."""
+    labels: tuple[str, ...]
+    """One per node."""
+    edges: tuple[tuple[str, str], ...]
+    """Directed, by node name."""
+    colors: tuple[Color, ...] = ()
+    """One per node, or none for the viewer's choice."""
+    positions: Floats | None = None
+    """N x 2, x right and y down in pixels; laid out by the viewer by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar:
+    """One value of a curve over steps."""
+
+    path: str
+    value: float
+    name: str = ""
+    """In the legend; the path's last part by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class BarChart:
+    """One bar per value."""
+
+    path: str
+    values: Floats
+    """Length N."""
+    color: Color | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Clear:
+    """Removes what stands at ``path`` and below it."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class NextStep:
+    """What follows is shown one step later: yielded between the frames of an animation, as a filter's iterations."""
+
+
+Drawing = (
+    Image
+    | DepthImage
+    | Boxes2D
+    | Pinhole
+    | Transform
+    | Mesh3D
+    | Points3D
+    | Lines3D
+    | Text
+    | Graph
+    | Scalar
+    | BarChart
+    | Clear
+    | NextStep
+)
+
+PanelKind = Literal["image", "space", "graph", "text", "bars", "series"]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One view on the drawings at and below ``origin``; ``contents`` adds or restricts what it shows.
+
+    ``contents`` are path expressions relative to the root: ``"/world/**"`` includes a subtree and
+    ``"- /world/particles/**"`` excludes one. Empty shows everything below ``origin``.
+    """
+
+    name: str
+    kind: PanelKind
+    origin: str
+    contents: tuple[str, ...] = ()
+    eye: tuple[float, float, float] | None = None
+    """Where a space is looked at from, in the frame of ``origin``, metres; the viewer's choice by default."""
+    target: tuple[float, float, float] | None = None
+    """The point in its middle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Layouts side by side; ``shares`` are relative widths, equal by default."""
+
+    parts: tuple[Layout, ...]
+    shares: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Layouts above each other; ``shares`` are relative heights, equal by default."""
+
+    parts: tuple[Layout, ...]
+    shares: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tabs:
+    """Layouts behind tabs, the first one open."""
+
+    parts: tuple[Layout, ...]
+
+
+Layout = Panel | Row | Column | Tabs
+
+
+class Views(Protocol):
+    """Turns the messages of a graph into drawings. Lives in its own process and may remember what it saw."""
+
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """``configs`` holds every stage's settings by stage name, as the graph ran with them."""
+        ...
+
+    def layout(self) -> Layout:
+        """How the panels are arranged."""
+        ...
+
+    def static(self) -> Iterable[Drawing]:
+        """What is there from the start and never changes, for example a robot's meshes."""
+        ...
+
+    def draw(self, message: Message) -> Iterable[Drawing]:
+        """What one message shows, in recorded order. Nothing for messages that are not worth a picture."""
+        ...

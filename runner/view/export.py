@@ -1,0 +1,373 @@
+"""Writes what a recording shows as Foxglove messages in an MCAP file, which Foxglove, Lichtblick and Rerun open.
+
+The drawings are those of ``runner view``. Images become RawImage, cameras CameraCalibration, points PointCloud, places
+FrameTransform, meshes and lines SceneUpdate, boxes ImageAnnotations, pages and log lines Log. What Foxglove has no
+message for (curves, bars, graphs) becomes JSON. Schemas and encoders are the Foxglove SDK's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from runner.contract import Level, Refused
+from runner.graph.graph import graph_from_json
+from runner.message.codec import LogLine
+from runner.recording.recording import Recording
+from runner.view import drawing as d
+from runner.view.rerun_view import drawn, load_views
+
+if TYPE_CHECKING:
+    from foxglove import messages as fox
+else:
+    try:
+        from foxglove import messages as fox
+    except ImportError:
+        fox = None
+
+STEP_NS = 33_000_000
+"""Between the steps of an animation."""
+LOGS, SCENE = "/log", "/scene"
+LABEL_PIXELS = 12.0
+_GREY: d.Color = (180, 180, 180)
+
+Written = tuple[str, Any]
+"""A topic, and a Foxglove message or a dict that becomes JSON."""
+
+
+def export(path: Path, target: Path) -> list[str]:
+    """Writes a recording's drawings and log; returns lines that say what was written.
+
+    Raises Refused where the SDK is missing, the file is no recording, its graph has no views or the target exists.
+    """
+    if fox is None:
+        raise Refused("runner export: the Foxglove SDK is missing; type: pip install 'scene-programming[foxglove]'")
+    recording = Recording(path)
+    graph = graph_from_json(recording.run["graph"], str(path))
+    views = load_views(graph)
+    try:
+        with target.open("xb") as output:
+            sink = _Sink(Writer(output, compression=CompressionType.ZSTD))
+            for line in recording.log:
+                sink.put(LOGS, _log_line(line), line.time_ns)
+            _write_drawings(recording, views, lambda id: drawn(graph, views, recording.envelope(id)), sink)
+            sink.finish()
+    except OSError as error:
+        raise Refused(f"{target}: cannot be written: {error.strerror}") from None
+    kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(sink.counts.items()))
+    return [f"{path}: {recording.verdict}", f"{target}: {kinds or 'nothing to show'}"]
+
+
+def _write_drawings(
+    recording: Recording, views: d.Views, draw: Callable[[str], Sequence[d.Drawing]], sink: _Sink
+) -> None:
+    """In the order of recording. Animations take time: what follows is never shown before they have ended."""
+    scribe = _Scribe()
+    now = min((message.log_time_ns for message in recording.messages.values()), default=0)
+    sink.put_all(scribe.written(list(views.static()), now), now)
+    for id, message in recording.messages.items():
+        now = max(now, message.log_time_ns)
+        for number, step in enumerate(_steps(draw(id))):
+            now += STEP_NS if number else 0
+            sink.put_all(scribe.written(step, now), now)
+
+
+def _steps(drawings: Sequence[d.Drawing]) -> Iterator[list[d.Drawing]]:
+    step: list[d.Drawing] = []
+    for drawing in drawings:
+        if isinstance(drawing, d.NextStep):
+            yield step
+            step = []
+        else:
+            step.append(drawing)
+    yield step
+
+
+class _Sink:
+    """An MCAP file of Foxglove messages."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.counts: Counter[str] = Counter()
+        self._writer = writer
+        self._channels: dict[str, int] = {}
+        writer.start(profile="", library="scene-programming")
+
+    def put_all(self, written: Iterable[Written], time_ns: int) -> None:
+        for topic, message in written:
+            self.put(topic, message, time_ns)
+
+    def put(self, topic: str, message: Any, time_ns: int) -> None:
+        plain = isinstance(message, dict)
+        if topic not in self._channels:
+            self._channels[topic] = self._register(topic, message, plain)
+        data = json.dumps(message).encode() if plain else message.encode()
+        self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
+        self.counts["JSON" if plain else type(message).__name__] += 1
+
+    def finish(self) -> None:
+        self._writer.finish()
+
+    def _register(self, topic: str, message: Any, plain: bool) -> int:
+        if plain:
+            schema = self._writer.register_schema("drawing", "jsonschema", b'{"type": "object"}')
+            return self._writer.register_channel(topic, "json", schema)
+        described = type(message).get_schema()
+        schema = self._writer.register_schema(described.name, described.encoding, described.data)
+        return self._writer.register_channel(topic, described.encoding, schema)
+
+
+class _Scribe:
+    """Turns drawings into Foxglove messages; remembers what stands where, for frames and for clearing."""
+
+    def __init__(self) -> None:
+        self._frames: set[str] = set()
+        """Paths that have been placed."""
+        self._standing: dict[str, d.Drawing] = {}
+
+    def written(self, drawings: Sequence[d.Drawing], now: int) -> Iterator[Written]:
+        """Places come first: what is drawn below them in the same step is in their frame."""
+        self._frames.update(_clean(drawing.path) for drawing in drawings if isinstance(drawing, d.Transform))
+        for drawing in drawings:
+            if isinstance(drawing, d.Clear):
+                yield from self._cleared(_clean(drawing.path), now)
+            elif not isinstance(drawing, d.NextStep):
+                path = _clean(drawing.path)
+                self._standing[path] = drawing
+                frame = self._parent(path) if isinstance(drawing, d.Transform) else self._frame(path)
+                yield from _MAPPINGS[type(drawing)](drawing, path, frame, _stamp(now))
+
+    def _frame(self, path: str) -> str:
+        """The nearest place at or above a path; its first part where there is none."""
+        parts = path.split("/")
+        above = ("/".join(parts[:length]) for length in range(len(parts), 0, -1))
+        return next((place for place in above if place in self._frames), parts[0])
+
+    def _parent(self, path: str) -> str:
+        above = path.rpartition("/")[0]
+        return self._frame(above) if above else "root"
+
+    def _cleared(self, path: str, now: int) -> Iterator[Written]:
+        stamp = _stamp(now)
+        gone = [place for place in self._standing if place == path or place.startswith(f"{path}/")]
+        for place in gone:
+            match self._standing.pop(place):
+                case d.Mesh3D() | d.Lines3D():
+                    kind = fox.SceneEntityDeletionType.MatchingId
+                    deletion = fox.SceneEntityDeletion(timestamp=stamp, type=kind, id=place)
+                    yield SCENE, fox.SceneUpdate(deletions=[deletion])
+                case d.Points3D():
+                    yield from _points(d.Points3D(place, np.zeros((0, 3))), place, self._frame(place), stamp)
+                case d.Boxes2D():
+                    yield from _boxes(d.Boxes2D(place, np.zeros((0, 4))), place, self._frame(place), stamp)
+                case _:
+                    pass
+
+
+def _stamp(time_ns: int) -> fox.Timestamp:
+    return fox.Timestamp(*divmod(time_ns, 10**9))
+
+
+def _clean(path: str) -> str:
+    return path.strip("/")
+
+
+def _image(image: d.Image, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    encoding = "rgba8" if image.rgb.shape[2] == 4 else "rgb8"
+    yield f"/{path}", _raw_image(np.ascontiguousarray(image.rgb), encoding, frame, stamp)
+
+
+def _depth(depth: d.DepthImage, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    """Metres as they are, in 32-bit floats."""
+    yield f"/{path}", _raw_image(np.ascontiguousarray(depth.depth, np.float32), "32FC1", frame, stamp)
+
+
+def _raw_image(pixels: NDArray[Any], encoding: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
+    height, width = pixels.shape[:2]
+    return fox.RawImage(
+        timestamp=stamp,
+        frame_id=frame,
+        width=width,
+        height=height,
+        encoding=encoding,
+        step=pixels.strides[0],
+        data=pixels.tobytes(),
+    )
+
+
+def _boxes(boxes: d.Boxes2D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    colors = boxes.colors or (_GREY,) * len(boxes.boxes)
+    outlines = [_outline(box, color, stamp) for box, color in zip(boxes.boxes.tolist(), colors, strict=True)]
+    labels = [
+        fox.TextAnnotation(
+            timestamp=stamp, position=_point2(*box[:2]), text=label, font_size=LABEL_PIXELS, text_color=_color(color)
+        )
+        for box, color, label in zip(boxes.boxes.tolist(), colors, boxes.labels, strict=False)
+    ]
+    yield f"/{path}", fox.ImageAnnotations(timestamp=stamp, points=outlines, texts=labels)
+
+
+def _outline(box: Sequence[float], color: d.Color, stamp: fox.Timestamp) -> fox.PointsAnnotation:
+    x0, y0, x1, y1 = box
+    corners = [_point2(x0, y0), _point2(x1, y0), _point2(x1, y1), _point2(x0, y1)]
+    kind = fox.PointsAnnotationType.LineLoop
+    return fox.PointsAnnotation(timestamp=stamp, type=kind, points=corners, outline_color=_color(color), thickness=2)
+
+
+def _pinhole(camera: d.Pinhole, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    K = np.asarray(camera.K, np.float64)
+    yield (
+        f"/{path}",
+        fox.CameraCalibration(
+            timestamp=stamp,
+            frame_id=frame,
+            width=camera.width,
+            height=camera.height,
+            K=K.ravel().tolist(),
+            R=np.eye(3).ravel().tolist(),
+            P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
+        ),
+    )
+
+
+def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    """Each point as three 32-bit floats and four bytes of colour."""
+    count = len(points.positions)
+    packed = np.zeros(count, np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
+    packed["position"] = points.positions
+    packed["color"] = (*_GREY, 255)
+    if points.colors is not None:
+        packed["color"][:, :3] = points.colors
+    number, byte = fox.PackedElementFieldNumericType.Float32, fox.PackedElementFieldNumericType.Uint8
+    fields = [fox.PackedElementField(name=name, offset=4 * k, type=number) for k, name in enumerate("xyz")]
+    channels = enumerate(("red", "green", "blue", "alpha"))
+    fields += [fox.PackedElementField(name=name, offset=12 + k, type=byte) for k, name in channels]
+    yield (
+        f"/{path}",
+        fox.PointCloud(
+            timestamp=stamp,
+            frame_id=frame,
+            pose=_still(),
+            point_stride=packed.itemsize,
+            fields=fields,
+            data=packed.tobytes(),
+        ),
+    )
+
+
+def _transform(place: d.Transform, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    x, y, z, w = Rotation.from_matrix(place.T[:3, :3]).as_quat().tolist()
+    yield (
+        "/tf",
+        fox.FrameTransform(
+            timestamp=stamp,
+            parent_frame_id=frame,
+            child_frame_id=path,
+            translation=_vector(place.T[:3, 3].tolist()),
+            rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
+        ),
+    )
+
+
+def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    several = None if mesh.colors is None or isinstance(mesh.colors, tuple) else mesh.colors
+    triangles = fox.TriangleListPrimitive(
+        pose=_still(),
+        points=_points3(mesh.vertices),
+        color=_color(mesh.colors if isinstance(mesh.colors, tuple) else _GREY),
+        colors=None if several is None else [_color(color) for color in several.tolist()],
+        indices=mesh.faces.ravel().tolist(),
+    )
+    yield _entity(path, frame, stamp, triangles=[triangles])
+
+
+def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    strips = [
+        fox.LinePrimitive(
+            type=fox.LinePrimitiveLineType.LineStrip,
+            pose=_still(),
+            thickness=2 * lines.radius,
+            points=_points3(strip),
+            color=_color(lines.color or _GREY),
+        )
+        for strip in lines.strips
+    ]
+    yield _entity(path, frame, stamp, lines=strips)
+
+
+def _entity(path: str, frame: str, stamp: fox.Timestamp, **shapes: Any) -> Written:
+    entity = fox.SceneEntity(timestamp=stamp, frame_id=frame, id=path, frame_locked=True, **shapes)
+    return SCENE, fox.SceneUpdate(entities=[entity])
+
+
+def _text(text: d.Text, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    yield f"/{path}", fox.Log(timestamp=stamp, level=fox.LogLevel.Info, name=path, message=text.markdown)
+
+
+def _log_line(line: LogLine) -> fox.Log:
+    levels: dict[Level, Any] = {
+        "debug": fox.LogLevel.Debug,
+        "info": fox.LogLevel.Info,
+        "warning": fox.LogLevel.Warning,
+        "error": fox.LogLevel.Error,
+    }
+    name = f"{line.stage}.{line.replica}" if line.replica else line.stage
+    return fox.Log(timestamp=_stamp(line.time_ns), level=levels[line.level], name=name, message=line.text)
+
+
+def _graph(graph: d.Graph, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    nodes = [{"name": name, "label": label} for name, label in zip(graph.nodes, graph.labels, strict=True)]
+    yield f"/{path}", {"nodes": nodes, "edges": [list(edge) for edge in graph.edges]}
+
+
+def _scalar(scalar: d.Scalar, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    yield f"/{path}", {"name": scalar.name or path.rpartition("/")[2], "value": scalar.value}
+
+
+def _bars(bars: d.BarChart, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+    yield f"/{path}", {"values": np.asarray(bars.values, np.float64).tolist()}
+
+
+def _color(color: Sequence[int]) -> fox.Color:
+    red, green, blue = (channel / 255 for channel in color[:3])
+    return fox.Color(r=red, g=green, b=blue, a=1.0)
+
+
+def _point2(x: float, y: float) -> fox.Point2:
+    return fox.Point2(x=x, y=y)
+
+
+def _vector(point: Sequence[float]) -> fox.Vector3:
+    return fox.Vector3(x=point[0], y=point[1], z=point[2])
+
+
+def _still() -> fox.Pose:
+    """The identity."""
+    return fox.Pose(position=_vector((0.0, 0.0, 0.0)), orientation=fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+
+
+def _points3(points: d.Floats) -> list[fox.Point3]:
+    return [fox.Point3(x=x, y=y, z=z) for x, y, z in np.asarray(points, np.float64).tolist()]
+
+
+_MAPPINGS: dict[type, Callable[[Any, str, str, Any], Iterator[Written]]] = {
+    d.Image: _image,
+    d.DepthImage: _depth,
+    d.Boxes2D: _boxes,
+    d.Pinhole: _pinhole,
+    d.Points3D: _points,
+    d.Transform: _transform,
+    d.Mesh3D: _mesh,
+    d.Lines3D: _lines,
+    d.Text: _text,
+    d.Graph: _graph,
+    d.Scalar: _scalar,
+    d.BarChart: _bars,
+}

@@ -1,0 +1,230 @@
+"""Shows a recording, finished or still growing, in a Rerun viewer, a file or a picture.
+
+A running graph is shown from the recording it writes: however slow the viewer is, the graph never waits for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import cast
+from urllib.parse import quote
+
+import rerun as rr
+import rerun_cli
+from mcap.records import Metadata
+
+from runner.contract import Refused
+from runner.graph.graph import Graph, graph_from_json, node_entry
+from runner.message.codec import CodecError, Envelope, open_envelope, unpack
+from runner.process.children import bound
+from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
+from runner.recording.recording import JOURNAL, LOG, RUN, Recording, split_id
+from runner.view.canvas import Canvas
+from runner.view.drawing import Drawing, Views
+
+RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
+"""The viewer itself: ``python -m rerun`` would stay between it and the signals that end it."""
+MEMORY = "2GB"
+"""Cap of a viewer; beyond it the oldest drawings go."""
+WINDOW = (1280, 800)
+"""Size of the window of a picture, in points of two pixels."""
+PACKAGES = "xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libxcursor1 libxi6 libxrandr2"
+SCREENSHOT_SECONDS = 120
+
+
+class Show:
+    """Draws the messages of one graph onto a Rerun stream, with the views the graph names."""
+
+    def __init__(self, graph: Graph, views: Views, stream: rr.RecordingStream) -> None:
+        self._graph = graph
+        self._views = views
+        self._canvas = Canvas(stream)
+        self._canvas.start(views.layout(), views.static())
+
+    def draw(self, sealed: Envelope) -> None:
+        """Draws one message; what cannot be drawn is named on stderr and left out."""
+        self._canvas.show(drawn(self._graph, self._views, sealed), time_ns=sealed.time_ns)
+
+
+def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
+    """What one message shows; what cannot be drawn is named on stderr and left out."""
+    stage, _, port = split_id(sealed.id)[0].partition(".")
+    found: list[Drawing] = []
+    try:
+        kind = graph.outputs_of(stage).get(port)
+        if kind is not None:
+            found.extend(views.draw(open_envelope(kind, sealed)))
+    except Exception as error:  # the rest of the recording is still worth seeing
+        reason = str(error).partition("\n")[0]
+        print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
+    return found
+
+
+def load_views(graph: Graph) -> Views:
+    """The views a graph names; raises Refused where it names none or they cannot be loaded."""
+    if graph.view is None:
+        raise Refused(f"graph {graph.name!r} names no views; valid: a line `view: module:Class` in the graph file")
+    module, _, name = graph.view.partition(":")
+    try:
+        views = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise Refused(f"view {graph.view!r} of graph {graph.name!r} cannot be loaded: {error}") from None
+    return cast("Views", views({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
+
+
+# ------------------------------------------------------------------------------------ recordings
+
+
+def view_recording(path: Path, *, save: Path | None = None, png: Path | None = None) -> None:
+    """Opens a viewer on a recording, or writes it as a Rerun file or a picture of its last state."""
+    recording = Recording(path)
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = save or Path(folder) / f"{path.stem}.rrd"
+        save_rrd(recording, rrd)
+        if png is not None:
+            screenshot(rrd, png)
+        if save is None and png is None:
+            _wait(_start_viewer(_free_port(), str(rrd)))
+
+
+def save_rrd(recording: Recording, target: Path) -> None:
+    """Draws a whole recording into a Rerun file."""
+    stream = _stream(recording.path)
+    stream.save(target)
+    show = _show(recording.run["graph"], recording.path, stream)
+    for sealed in recording.envelopes():
+        show.draw(sealed)
+    stream.flush()
+    stream.disconnect()
+
+
+def _show(graph_json: str, path: Path, stream: rr.RecordingStream) -> Show:
+    graph = graph_from_json(graph_json, str(path))
+    return Show(graph, load_views(graph), stream)
+
+
+def _stream(path: Path) -> rr.RecordingStream:
+    return rr.RecordingStream("scene programming", recording_id=path.stem)
+
+
+# ------------------------------------------------------------------------------------ live
+
+
+def view_live(path: Path | None = None, *, folder: Path = Path("recordings")) -> None:
+    """Shows a graph while it runs: ``path`` is its recording, by default the one in ``folder`` being written."""
+    path = path or newest_live(folder)
+    # The graph comes first: drawing, and the viewer that this starts, take what it leaves of the cores.
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    port = _free_port()
+    viewer = _start_viewer(port, "--expect-data-soon")
+    try:
+        stream = _stream(path)
+        stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+        follow(path, stream, stopped=lambda: viewer.poll() is not None)
+    finally:
+        _wait(viewer)
+
+
+def newest_live(folder: Path) -> Path:
+    """The newest recording that a running graph writes; raises Refused where there is none."""
+    for path in sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True):
+        with path.open("rb") as file:
+            if is_being_written(file):
+                return path
+    raise Refused(f"{folder}: no graph is running here: no recording is being written")
+
+
+def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool] = lambda: False) -> None:
+    """Draws what a recording holds and goes on as it grows, until its graph has ended or ``stopped()``."""
+    show: Show | None = None
+    with open_file(path) as file:
+        for record in Container(Growing(file, stopped), str(path)):
+            if isinstance(record, Metadata) and record.name == RUN:
+                show = _show(record.metadata["graph"], path, stream)
+            elif isinstance(record, Entry) and show is not None:
+                _draw_entry(show, record)
+    stream.flush()
+
+
+def _draw_entry(show: Show, entry: Entry) -> None:
+    if not entry.topic.startswith((JOURNAL, LOG)):
+        with contextlib.suppress(CodecError):
+            show.draw(unpack(Envelope, entry.data))
+
+
+# ------------------------------------------------------------------------------------ the viewer's process
+
+
+def _start_viewer(port: int, *arguments: str) -> subprocess.Popen[bytes]:
+    """A window where there is a display, a page on loopback elsewhere; takes drawings on ``port``."""
+    command = [RERUN, "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, *arguments]
+    if not _has_display():
+        web = _free_port()
+        command += ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", MEMORY]
+        source = quote(f"rerun+http://127.0.0.1:{port}/proxy", safe="")
+        print(f"viewer: http://127.0.0.1:{web}/?url={source} (Ctrl-C closes it)", flush=True)
+    return subprocess.Popen(bound(command), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _has_display() -> bool:
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _wait(viewer: subprocess.Popen[bytes]) -> None:
+    """Waits until the user closes the viewer or presses Ctrl-C."""
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            viewer.wait()
+    finally:
+        viewer.terminate()
+        viewer.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+# ------------------------------------------------------------------------------------ pictures
+
+
+def screenshot(rrd: Path, png: Path) -> None:
+    """Renders the last state of a Rerun file without a display; raises Refused where tools are missing."""
+    size = "x".join(map(str, WINDOW))
+    command = [RERUN, "--bind", "127.0.0.1", "--port", str(_free_port())]
+    command += ["--window-size", size, "--screenshot-to", str(png.absolute()), str(rrd.absolute())]
+    png.unlink(missing_ok=True)
+    with _virtual_display(size) as display, tempfile.TemporaryDirectory() as runtime:
+        settings = {"WGPU_BACKEND": "vulkan", "XDG_RUNTIME_DIR": runtime}
+        environment = {**os.environ, **settings, "DISPLAY": display}
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            subprocess.run(command, env=environment, capture_output=True, timeout=SCREENSHOT_SECONDS, check=False)
+    if not png.exists():
+        raise Refused(f"{png}: the viewer could not render; it needs: apt-get install {PACKAGES}")
+
+
+@contextlib.contextmanager
+def _virtual_display(size: str) -> Generator[str]:
+    """An X server without a screen, as ``:number``."""
+    if shutil.which("Xvfb") is None:
+        raise Refused(f"a picture needs a virtual display: apt-get install {PACKAGES}")
+    reading, writing = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", f"{size}x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(bound(command), pass_fds=(writing,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.close(writing)
+    try:
+        with os.fdopen(reading) as ready:
+            yield f":{ready.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait()
