@@ -13,7 +13,7 @@ import numpy as np
 import zenoh
 
 from benchmarks.transport.schedule import Schedule
-from runner.transport.session import free_endpoint
+from runner.transport.session import new_endpoint
 
 
 def session(listen: str, connect: str | None) -> zenoh.Session:
@@ -44,7 +44,7 @@ def receive(endpoint: str) -> None:
 
 def send(messages: int) -> None:
     """Prints the times of all sizes as JSON."""
-    endpoint = free_endpoint()
+    endpoint = new_endpoint()
     peer = session(endpoint, None)
     arrived: queue.SimpleQueue[int] = queue.SimpleQueue()
     peer.declare_subscriber("transport/arrived", lambda sample: arrived.put(_time(sample)))

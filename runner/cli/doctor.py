@@ -7,7 +7,6 @@ import importlib.metadata
 import os
 import re
 import resource
-import secrets
 import shutil
 import socket
 import subprocess
@@ -17,22 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import zenoh
-
 from runner.contract import Refused
 from runner.graph.graph import load_graph
 from runner.inspect.info import byte_count
 from runner.live.tables import from_here
-from runner.message.packet import Packet, Process
-from runner.supervise.registry import registry_folder
-from runner.transport.arena import Store
 from runner.transport.bus import Bus
-from runner.transport.links import Door, Link, address_of
-from runner.transport.session import free_endpoint
+from runner.transport.session import new_endpoint, remove_sockets, runtime_folder
 
 Judgement = Literal["good", "note", "bad"]
 LEAST_DISK = 2 * 10**9
-_SECCOMP = "allow memfd_create and abstract sockets in the container's seccomp and AppArmor profiles"
 LEAST_MEMORY = 2 * 10**9
 LEAST_FILES = 1024
 LEAST_PROCESSES = 256
@@ -66,7 +58,6 @@ def examine(recordings: Path) -> Iterator[Finding]:
         ("python", _python),
         ("packages", _packages),
         ("EGL", _egl),
-        ("direct link", _direct_link),
         ("loopback", _loopback),
         ("zenoh", _zenoh),
         ("runs", _runs),
@@ -192,26 +183,6 @@ def probe_egl() -> str:
 # ------------------------------------------------------------------------------------------ transport
 
 
-def _direct_link() -> Iterator[Finding]:
-    """A message as it goes from one process of this machine to another."""
-    sent, taken = bytes(10**6), list[Packet]()
-    address = address_of("doctor", secrets.token_hex(8), "", Process("doctor", 0))
-    try:
-        door, store = Door(address, "", taken.append, lambda _, error: None), Store()
-        link = Link(address, "", "doctor", store)
-        link.send("message", sent)
-        door.look(wait=False)
-        whole = [bytes(packet.payload) for packet in taken] == [sent]
-        taken.clear()
-        link.close()
-        door.close()
-        store.close()
-    except OSError as error:
-        yield Finding("note", "direct link", f"{error.strerror}: messages take Zenoh, which is slower", _SECCOMP)
-        return
-    yield Finding("good" if whole else "bad", "direct link", "a message of 1 MB goes through shared memory")
-
-
 def _loopback() -> Iterator[Finding]:
     with socket.socket() as server, socket.socket() as client:
         server.bind(("127.0.0.1", 0))
@@ -224,24 +195,23 @@ def _loopback() -> Iterator[Finding]:
 def _zenoh() -> Iterator[Finding]:
     """Two sessions as two processes of a graph would have them, and a question from one to the other."""
     version = importlib.metadata.version("eclipse-zenoh")
-    endpoint = free_endpoint()
+    endpoint = new_endpoint()
     try:
-        server = Bus("doctor", listen=endpoint)
-        client = Bus("doctor", connect=endpoint)
+        server, client = Bus("doctor", endpoint, listen=True), Bus("doctor", endpoint)
         server.serve("echo", lambda question: question)
         answer = client.ask("echo", b"well", 10)
         client.close()
         server.close()
-    except (zenoh.ZError, Refused) as error:
-        yield Finding(
-            "bad", "zenoh", f"{version}: two sessions do not meet: {error}", "see whether a firewall guards loopback"
-        )
+    except Refused as refusal:
+        yield Finding("bad", "zenoh", f"{version}: two sessions do not meet: {refusal}")
         return
-    yield Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet on {endpoint}")
+    finally:
+        remove_sockets(endpoint)
+    yield Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet at a socket")
 
 
 def _runs() -> Iterator[Finding]:
-    yield Finding("good", "runs", f"are listed in {registry_folder()}")
+    yield Finding("good", "runs", f"are listed in {runtime_folder()}")
 
 
 # ------------------------------------------------------------------------------------------ resources

@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.graph.document import Document, Keys, read_document, suggest
-from runner.graph.placement import ALONE, Layout, read_layout, read_placement
+from runner.graph.placement import ALONE, Layout, read_layout, read_listen, read_placement
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
 
 T = TypeVar("T")
@@ -26,7 +26,7 @@ K = TypeVar("K")
 MISSING = "???"
 """Stands in a graph file where the user must give a value with ``--set``."""
 SUPERVISOR = "supervisor"
-RESERVED = (SUPERVISOR, "recorder", "viewer")
+RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway")
 SUPERVISOR_OUTPUTS: dict[str, type[Message]] = {port_name(Restarted): Restarted}
 FINISHED = port_name(Finished)
 RESTARTS = 3
@@ -82,6 +82,9 @@ class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stages: dict[str, StageEntry]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
     view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
+    listen: Annotated[
+        str | None, Meta(description="Where others may listen, for example tcp/127.0.0.1:7447; only this user without")
+    ] = None
     hosts: Annotated[
         dict[str, str] | None, Meta(description="Machine -> ADDRESS[:PORT]; the first is the head and needs a port")
     ] = None
@@ -181,6 +184,18 @@ class Route(msgspec.Struct, frozen=True):
     be under way on any of its ports; 0 where it uses each once."""
 
 
+class Destination(msgspec.Struct, frozen=True):
+    """One edge as the recorder knows it."""
+
+    route: Route
+    replicas: int
+
+    @property
+    def takers(self) -> Iterable[int]:
+        """Who has to do with a message: each replica, or (-1) any of them."""
+        return (-1,) if self.route.shared else range(self.replicas)
+
+
 @dataclass(frozen=True, slots=True)
 class Graph:
     """A checked graph."""
@@ -192,6 +207,8 @@ class Graph:
     score: str | None = None
     tolerances: str | None = None
     layout: Layout = ALONE
+    listen: str | None = None
+    """Where everybody may listen who can call there."""
 
     def host_of(self, stage: str, replica: int) -> str | None:
         """The machine of a process; None where the graph names no machines."""
@@ -218,6 +235,15 @@ class Graph:
             for port, edge in node.inputs.items()
             if edge.stage == stage
         ]
+
+    def destinations(self) -> dict[str, tuple[Destination, ...]]:
+        """Where the messages of every output port go, by ``STAGE/PORT``."""
+        found: dict[str, tuple[Destination, ...]] = {}
+        for stage in (*self.nodes, SUPERVISOR):
+            for route in self.routes(stage):
+                topic = f"{stage}/{route.output}"
+                found[topic] = (*found.get(topic, ()), Destination(route, self.nodes[route.consumer].replicas))
+        return found
 
     def outputs_of(self, stage: str) -> dict[str, type[Message]]:
         """Output ports of a stage or of the supervisor."""
@@ -255,7 +281,7 @@ def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
 def graph_to_json(graph: Graph) -> str:
     """The graph as it runs, every setting written out: what processes are given and recordings keep."""
     stages = {node.name: node_entry(node) for node in graph.nodes.values()}
-    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "score", "tolerances")}
+    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "listen", "score", "tolerances")}
     return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
 
 
@@ -311,7 +337,8 @@ def _build(document: Document) -> Graph:
     _resolve_settings(document, entries, types)
     nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
     layout = read_layout(document)
-    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout)
+    listen = read_listen(document, layout)
+    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout, listen)
     _collect(
         lambda keys: _check_edge(document, checked, *keys),
         [(node, port) for node in names for port in nodes[node].inputs],

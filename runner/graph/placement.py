@@ -27,7 +27,9 @@ from runner.graph.document import Document, read_document, suggest
 LOOPBACK = "127.0.0.1"
 ROUTER = "router"
 """Common name of a router that is none of the hosts."""
-RESERVED = (ROUTER, "ca")
+READER = "reader"
+"""Common name of who may listen at a run's public address, and do nothing else."""
+RESERVED = (ROUTER, READER, "ca")
 
 
 class Credentials(msgspec.Struct, frozen=True):
@@ -240,6 +242,29 @@ def _refuse_open(document: Document, layout: Layout) -> None:
                 f"{place}: {host.address} is not loopback, and without keys anybody who reaches it could take part; "
                 f"type: runner keys init {document.label}, and add to the graph: keys: keys"
             )
+
+
+def read_listen(document: Document, layout: Layout) -> str | None:
+    """Where others may listen to a graph; raises Refused where that is no address, or not safe without keys."""
+    value, place = document.values.get("listen"), document.place("listen")
+    if value is None:
+        return None
+    protocol, _, address = str(value).partition("/")
+    if protocol not in ("tcp", "tls"):
+        raise Refused(f"{place}: {value!r}: valid: tcp/127.0.0.1:7447, or with keys tls/ADDRESS:PORT")
+    host = read_endpoint(address, place, name="whoever listens")
+    if not host.port:
+        raise Refused(f"{place}: {value!r}: the port is missing; valid: {value}:7447")
+    if (protocol == "tls") != (layout.keys is not None):
+        wanted = "tls/" if layout.keys is not None else "tcp/"
+        why = "a graph with keys is heard over TLS" if layout.keys is not None else "TLS needs hosts and keys"
+        raise Refused(f"{place}: {value!r}: {why}; valid: {wanted}{address}")
+    if protocol == "tcp" and not host.loopback:
+        raise Refused(
+            f"{place}: {address} is not loopback, and without keys anybody who reaches it could listen; "
+            f"valid: tcp/127.0.0.1:{host.port}, or hosts and keys (runner keys init)"
+        )
+    return str(value)
 
 
 def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:

@@ -39,6 +39,7 @@ from runner.process.children import Family, behind, last_lines, signal_group, sp
 from runner.recording.provenance import revision
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
+from runner.transport.session import private
 
 ASK_SECONDS = 15.0
 GRACE_SECONDS = 2.0
@@ -78,7 +79,7 @@ class Agent:
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, signal.SIG_DFL)
         own = Process(self._host, 0, self._session)
-        bus = Bus(control(name), connect=self._layout.endpoint, network=self._network, process=own)
+        bus = Bus(control(name), private(self._layout.endpoint), network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
         self._family = Family()
@@ -155,7 +156,8 @@ class Agent:
 
     def _start(self, order: Start, folder: Path) -> Report:
         process = order.process
-        task = msgspec.structs.replace(order.task, directory=str(folder.absolute()), network=self._network)
+        own = {"directory": str(folder.absolute()), "network": self._network, "gateway": ""}
+        task = msgspec.structs.replace(order.task, **own)
         log = folder / "log" / f"{process.stage}-{process.replica}.txt"
         mark = self._family.mark(process.path)
         child = _Child(spawn("runner.process.stage_process", task=msgspec.json.encode(task), log=log, mark=mark), log)

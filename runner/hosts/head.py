@@ -32,7 +32,7 @@ from runner.message.packet import Packet, Process
 from runner.process.stage_process import Assignment
 from runner.recording.provenance import fingerprint, machine, package_versions, revision
 from runner.transport.bus import Bus
-from runner.transport.session import Router, free_endpoint
+from runner.transport.session import Router, private
 
 ABSENT_SECONDS = 60.0
 """How long a host that is cut off may stay away while a stage has no other process."""
@@ -178,7 +178,7 @@ class Hosts:
     def __init__(self, name: str, file: Path, layout: Layout, say: Callable[[str, Level], None]):
         """Opens the place where all meet; ``name`` and ``file`` are the graph's. Raises Refused where it is taken."""
         self.network = network = network_of(layout, layout.head.name)
-        self.endpoint = layout.endpoint
+        self.endpoint = private(layout.endpoint)
         self._document = read_document(file)
         self._say = say
         self._run = ""
@@ -188,18 +188,8 @@ class Hosts:
         self._changed = threading.Condition(threading.RLock())
         self._remind_at = time.monotonic()
         self._router = Router(self.endpoint, network) if layout.router_is_head else None
-        listen = None if network.routed else self.endpoint
-        self._bus = Bus(
-            control(name),
-            listen=listen,
-            connect=None if listen else self.endpoint,
-            network=network,
-            process=Process(network.head, 0, secrets.randbits(24)),
-        )
-
-    def listen(self) -> str | None:
-        """An endpoint for the head's own session of the run; None where it meets the others at a router."""
-        return None if self.network.routed else free_endpoint(self.network.listen)
+        own = Process(network.head, 0, secrets.randbits(24))
+        self._bus = Bus(control(name), self.endpoint, network=network, process=own, listen=not network.routed)
 
     def open(self, run: str, recording: Path) -> None:
         """Lets hosts join a run, and read what has been recorded of it."""

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import queue
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
-import zenoh
 
 from runner.contract import Refused
 from runner.graph.document import suggest
 from runner.message.packet import Packet
-from runner.process.tap import Header, Listener
 from runner.supervise.calls import CallQuestion, CallRequest, CommandType, Progress
 from runner.supervise.registry import Entry, is_alive
 from runner.supervise.status import RunStatus
-from runner.transport.bus import Bus
+from runner.transport.bus import Listener
 
 T = TypeVar("T")
 ANSWER_SECONDS = 10.0
@@ -31,6 +31,43 @@ WINDOW_NS = 10_000_000_000
 """Rates are taken over the last ten seconds."""
 
 
+BACKLOG = 1000
+"""Messages that a slow terminal may fall behind; the rest is left out."""
+
+
+class Header(NamedTuple):
+    """What is known of a message without its content."""
+
+    sent_ns: int
+    arrived_ns: int
+    size: int
+    """Bytes of the envelope."""
+
+    @staticmethod
+    def of(packet: Packet) -> Header:
+        """Those of a message."""
+        return Header(packet.sent_ns, packet.arrived_ns, len(packet.payload))
+
+
+class Backlog:
+    """What a terminal has still to show of some messages."""
+
+    def __init__(self, bus: Listener, path: str) -> None:
+        self._packets: queue.Queue[Packet] = queue.Queue(BACKLOG)
+        bus.hand_over(path, self._receive)
+
+    def take(self, timeout_s: float) -> Iterator[Packet]:
+        """What has arrived; waits for the first, but not for longer than ``timeout_s``."""
+        with contextlib.suppress(queue.Empty):
+            yield self._packets.get(timeout=timeout_s)
+            while True:
+                yield self._packets.get_nowait()
+
+    def _receive(self, packet: Packet) -> None:
+        with contextlib.suppress(queue.Full):
+            self._packets.put_nowait(packet)
+
+
 class Live:
     """A connection to one run, to be used in a ``with`` statement."""
 
@@ -38,9 +75,9 @@ class Live:
         """Raises Refused where the run does not answer any more."""
         self.entry = entry
         try:
-            self.bus = Bus(entry.run, connect=entry.endpoint, network=entry.network, secret=entry.secret, guest=True)
-        except zenoh.ZError as error:
-            raise Refused(f"{entry.run}: cannot be reached at {entry.endpoint}: {error}") from None
+            self.bus = Listener(entry.run, entry.gateway)
+        except Refused as refusal:
+            raise Refused(f"{entry.run}: cannot be reached: {refusal}") from None
 
     def __enter__(self) -> Live:
         return self
@@ -90,26 +127,24 @@ class Live:
 
     def messages(self, topic: str) -> Iterator[Packet]:
         """Messages of a topic (``stage/port``) from now on, until the run ends."""
-        listener = Listener(self.bus)
-        listener.messages(self._known(topic))
+        backlog = Backlog(self.bus, f"m/{self._known(topic)}")
         while True:
-            packets = list(listener.take(POLL_SECONDS))
+            packets = list(backlog.take(POLL_SECONDS))
             yield from packets
             if not packets and not is_alive(self.entry):
                 return
 
     def headers(self, topic: str) -> Iterator[list[Header]]:
         """Once a second the headers of the last ten seconds, until the run ends."""
-        listener, window = Listener(self.bus), deque[Packet]()
-        listener.headers(self._known(topic))
+        backlog, window = Backlog(self.bus, f"m/{self._known(topic)}"), deque[Header]()
         due = time.monotonic() + 1.0
         while is_alive(self.entry):
-            window.extend(listener.take(POLL_SECONDS))
+            window.extend(map(Header.of, backlog.take(POLL_SECONDS)))
             if time.monotonic() >= due:
                 due += 1.0
                 while window and window[0].arrived_ns < time.monotonic_ns() - WINDOW_NS:
                     window.popleft()
-                yield [Header.unpack(packet.payload) for packet in window]
+                yield list(window)
 
     def _known(self, topic: str) -> str:
         """The topic as its key spells it; raises Refused where the run has none of that name."""

@@ -14,8 +14,8 @@ from runner.contract import Refused
 from runner.graph.document import suggest
 from runner.inspect.echo import lines_of
 from runner.inspect.info import byte_count, seconds, table
+from runner.live.live import Header
 from runner.message.codec import LogLine
-from runner.process.tap import Header
 from runner.supervise.calls import CommandType, Progress
 from runner.supervise.status import Flow, ProcessStatus, RunStatus
 from runner.terminal import Terminal

@@ -111,19 +111,23 @@ class Lost(msgspec.Struct, frozen=True):
     """Wall clock, nanoseconds since the epoch."""
 
 
+def answered(step: Step) -> tuple[tuple[str, MessageId], ...]:
+    """(port, message id) of what a step has done with; what a process leaves at its end is for its successor."""
+    return (*(step.consumed if step.outcome == "done" else ()), *(step.left if step.outcome != "ended" else ()))
+
+
 class Journal(msgspec.Struct, frozen=True):
-    """Steps of one stage that the recorder has, in its order."""
+    """What the recorder has of one stage, in its order."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[Step, ...] = ()
+    answered: tuple[tuple[str, MessageId], ...] = ()
+    """(port, message id) that the stage had done with before the recorder had the message."""
 
 
-class Receipt(msgspec.Struct, frozen=True):
-    """What a consumer says of one message (port, id) as it arrives, before it is worked on."""
+class Deal(msgspec.Struct, frozen=True):
+    """The part that a replica is to work on; the others leave it alone."""
 
-    port: str
     id: MessageId
-    consumed: bool = False
-    """True for one that arrived again after it had been consumed."""
 
 
 class LogLine(msgspec.Struct, frozen=True):
@@ -391,7 +395,7 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
     return array
 
 
-def pack(record: Envelope | Step | Journal | Receipt | LogLine | Pulse) -> bytes:
+def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike."""
     return _encoder().encode(record)
 

@@ -24,9 +24,9 @@ class Refusals:
         self._counting = threading.Lock()
 
     def read(self, kind: type[R], packet: Packet) -> R | None:
-        """The record that a process of this run has sent, or None: then it is refused."""
+        """The record that has been sent, or None: then it is refused."""
         try:
-            return admit(kind, packet)
+            return codec.unpack(kind, packet.payload)
         except CodecError as error:
             self.refuse(packet.key, error)
             return None
@@ -38,16 +38,3 @@ class Refusals:
             count = self.count
         if count <= SHOWN or str(count).strip("0") == "1":
             self._show(f"{key[:100]}: message refused ({count} so far): {error}")
-
-
-def admit(kind: type[R], packet: Packet) -> R:
-    """Reads a record; raises CodecError where it is none, or where a stranger has sent it."""
-    record = codec.unpack(kind, packet.payload)
-    require_genuine(packet)
-    return record
-
-
-def require_genuine(packet: Packet) -> None:
-    """Raises CodecError where a stranger has sent it."""
-    if not packet.genuine:
-        raise CodecError(packet.key.partition("/")[0], "", "not sent by a process of this run")

@@ -1,8 +1,10 @@
 """Puts messages together to steps: joins and gathers by lineage, whatever the order of arrival."""
 
+import contextlib
+import queue
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -20,7 +22,7 @@ class Mailbox:
 
     def __init__(self, node: Node):
         self._latest = {port for port, edge in node.inputs.items() if edge.policy == "latest"}
-        self._queue: deque[Packet | str] = deque()
+        self._queue: queue.SimpleQueue[tuple[str, Packet | None]] = queue.SimpleQueue()
         self._newest: dict[str, Packet] = {}
         self._exchanging = threading.Lock()
         self._come = dict.fromkeys(node.inputs, 0)
@@ -29,41 +31,79 @@ class Mailbox:
         self.replaced = dict.fromkeys(node.inputs, 0)
         """Messages that a newer one replaced before they were decoded."""
 
-    def put(self, packet: Packet) -> None:
+    def put(self, port: str, packet: Packet) -> None:
         """Takes a packet, from any thread."""
-        port = packet.end
+        if port not in self._latest:
+            if port in self._come:
+                self._come[port] += 1
+            self._queue.put((port, packet))
+            return
         with self._exchanging:
-            if port not in self._latest or not packet.genuine:
-                if port in self._come:
-                    self._come[port] += 1
-                self._queue.append(packet)
-                return
             self.replaced[port] += port in self._newest
             if port not in self._newest:
-                self._queue.append(port)
+                self._queue.put((port, None))
             self._newest[port] = packet
 
-    @property
-    def empty(self) -> bool:
-        """Whether there is nothing to take."""
-        return not self._queue
+    def wake(self) -> None:
+        """Ends a wait. May be called from any thread and from a signal handler."""
+        self._queue.put(("", None))
 
-    def take(self) -> Iterator[Packet]:
-        """Every packet that is there."""
-        while self._queue:
-            yield self._fetch(self._queue.popleft())
+    def take(self, *, wait: bool) -> Iterator[tuple[str, Packet]]:
+        """Every (port, packet) that is there; waits for one where there is none, or until it is woken."""
+        with contextlib.suppress(queue.Empty):
+            port, packet = self._queue.get(block=wait)
+            while True:
+                if port:
+                    yield port, packet or self._fetch_newest(port)
+                    self._fetched[port] = self._fetched.get(port, 0) + (packet is not None)
+                port, packet = self._queue.get_nowait()
 
-    def _fetch(self, item: Packet | str) -> Packet:
-        if isinstance(item, str):
-            with self._exchanging:
-                return self._newest.pop(item)
-        if (port := item.end) in self._fetched:
-            self._fetched[port] += 1
-        return item
+    def _fetch_newest(self, port: str) -> Packet:
+        with self._exchanging:
+            return self._newest.pop(port)
 
     def waiting(self, port: str) -> int:
         """How many packets of a port wait. May be called from any thread."""
         return self._come[port] - self._fetched[port] + (port in self._newest)
+
+
+class Parts:
+    """Parts that are there for all replicas of a stage, each of which works on those that it is dealt."""
+
+    def __init__(self) -> None:
+        self._there: dict[tuple[str, str], Packet] = {}
+        """By (port, id); whose they are is not known yet."""
+        self._dealt: set[tuple[str, str]] = set()
+        """Those of this replica that are still to come."""
+        self._changing = threading.Lock()
+
+    def came(self, port: str, id: str, packet: Packet) -> Packet | None:
+        """Takes a part; returns it where it is this replica's."""
+        with self._changing:
+            if (port, id) in self._dealt:
+                self._dealt.discard((port, id))
+                return packet
+            self._there[port, id] = packet
+            return None
+
+    def deal(self, port: str, id: str) -> Packet | None:
+        """Takes note that a part is this replica's; returns it where it is there."""
+        with self._changing:
+            packet = self._there.pop((port, id), None)
+            if packet is None:
+                self._dealt.add((port, id))
+            return packet
+
+    def forget(self, done: Iterable[tuple[str, str]]) -> None:
+        """Lets go of (port, id) that a replica has done with."""
+        with self._changing:
+            for key in done:
+                self._there.pop(key, None)
+                self._dealt.discard(key)
+
+    def left(self) -> list[tuple[str, str]]:
+        """(port, id) of what nobody has been heard to work on."""
+        return list(self._there)
 
 
 class Mismatched(Exception):
@@ -97,6 +137,10 @@ class Inbox:
         """Messages that no step has taken yet, by port; not those that a join keeps for its parts."""
         self.skipped = dict.fromkeys(node.inputs, 0)
         """Messages that a newer one replaced, by port, on edges of policy ``latest``."""
+        self._used: set[str] = set()
+        """Ids of what is kept and has been part of a step."""
+        self._unused: list[tuple[str, str]] = []
+        """(port, id) of what was forgotten without having been part of any."""
 
     def add(self, arrival: Arrival) -> None:
         """Takes a message; raises Mismatched for a part that contradicts its siblings."""
@@ -132,6 +176,27 @@ class Inbox:
             self._count(ready.handler, arrival.port, -1)
         return ready
 
+    def take_unused(self) -> tuple[tuple[str, str], ...]:
+        """(port, id) of what has been put aside since the last call and was never part of a step."""
+        unused, self._unused = tuple(self._unused), []
+        return unused
+
+    def left(self) -> Iterator[tuple[str, str]]:
+        """(port, id) of everything that has been part of no step."""
+        for ready in self._ready:
+            yield from ((arrival.port.name, arrival.envelope.id) for arrival in ready.arrivals)
+        for lineages in self._lineages.values():
+            for lineage in lineages.values():
+                yield from self._unused_of(lineage)
+
+    def _unused_of(self, lineage: _Lineage) -> Iterator[tuple[str, str]]:
+        for port, arrivals in lineage.waiting.items():
+            for arrival in arrivals:
+                if arrival.envelope.id in self._used:
+                    self._used.discard(arrival.envelope.id)
+                else:
+                    yield port, arrival.envelope.id
+
     def incomplete(self) -> Iterator[tuple[Handler, str, list[str]]]:
         """(handler, lineage, ports that lack) for everything that cannot run yet."""
         for handler in self._node.type.handlers:
@@ -153,6 +218,7 @@ class Inbox:
         lineage = self._lineages[handler.name].get(root, _Lineage())
         while all(_satisfied(port, lineage) for port in handler.inputs):
             arrivals = [arrival for port in handler.inputs for arrival in _take(handler, port, lineage)]
+            self._used.update(arrival.envelope.id for arrival in arrivals if handler.keeps(arrival.port))
             yield Ready(handler, tuple(arrivals))
         if not any(lineage.waiting.values()):
             self._lineages[handler.name].pop(root, None)
@@ -183,7 +249,7 @@ class Inbox:
             finished = next((root for root, lineage in lineages.items() if _only_stays(handler, lineage)), None)
             if finished is None:
                 return
-            del lineages[finished]
+            self._unused += self._unused_of(lineages.pop(finished))
 
 
 def _turn_port(handler: Handler) -> InputPort | None:

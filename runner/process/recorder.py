@@ -1,4 +1,4 @@
-"""The process that records a run: hears everything, has it written, and echoes what counts from then on."""
+"""The process that records a run: hears everything, has it written, and says what counts from then on."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
 
 from runner.contract import Refused
-from runner.message.codec import CodecError, Envelope, Journal, LogLine, Step, pack, unpack
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, explain_death, is_orphan
 from runner.process.health import Heart
-from runner.process.tap import Tap
+from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
-from runner.recording.writer import Kind, Manifest, RecordingWriter
+from runner.recording.writer import Manifest, RecordingWriter
 from runner.transport.bus import Bus
 
 TICK_SECONDS = 0.25
@@ -38,10 +38,10 @@ EXIT_INCOMPLETE = 1
 EXIT_REFUSED = 2
 REST_SECONDS = 0.005
 """What may come together before the recorder looks again."""
-ECHO_REST_SECONDS = 0.002
-"""What may come together before it is echoed."""
-_Echo = Step | Callable[[], None] | None
-"""A step, what else is to be done in its turn, or the end."""
+SAY_REST_SECONDS = 0.002
+"""What may come together before it is said."""
+_Saying = Step | tuple[str, Journal | bytes | memoryview] | None
+"""A step, what else is said under which key, or the end."""
 
 
 class Recorder:
@@ -51,46 +51,40 @@ class Recorder:
         """Creates the recording; raises Refused where that fails."""
         self._ends: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._manifest = manifest
+        own = Process(RECORDER, 0)
         self._bus = Bus(
-            manifest.run,
-            connect=manifest.endpoint,
-            network=manifest.network,
-            secret=manifest.secret,
-            process=Process(RECORDER, 0),
+            manifest.run, manifest.endpoint, gateway=manifest.gateway, network=manifest.network, process=own
         )
         self._writer = RecordingWriter(manifest, self._complain)
-        self._tap = Tap(self._bus)
-        self._echoes: queue.SimpleQueue[_Echo] = queue.SimpleQueue()
-        self._gone: set[Process] = set()
-        self._echoer = threading.Thread(target=self._echo_all, name="echo", daemon=True)
         self._refusals = Refusals(self._complain)
-        self._door = self._bus.open_door(self._on_delivery, self._refusals.refuse)
-        self._reader = threading.Thread(target=self._read_all, name="door", daemon=True)
+        self._redelivery = Redelivery(manifest.destinations, self._send_again)
+        self._said: queue.SimpleQueue[_Saying] = queue.SimpleQueue()
+        self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
+        self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
         self._ended = threading.Event()
+        self._changing = threading.Lock()
         self._present: set[Process] = set()
-        """Processes of stages."""
-        self._heart = Heart(Process(RECORDER, 0), self._bus, self._vitals)
+        self._appeared: list[Process] = []
+        """Not yet told what they have to do."""
+        self._lost: dict[Process, bool] = {}
+        """By the supervisor's word; whether all that they have sent is here."""
+        self._heart = Heart(own, self._bus, self._vitals)
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
-        self._echoer.start()
-        self._reader.start()
-        self._bus.subscribe("m/**", self._on_message)
-        self._bus.subscribe("s/*", self._on_step)
-        self._bus.subscribe("l/*", self._on_log)
         self._bus.watch(self._on_presence, self._refusals.refuse)
-        self._bus.answer_flush(self._when_all_is_said)
+        self._heard = self._bus.channel("*/**")
+        self._speaker.start()
+        self._taker.start()
         self._bus.announce()
         self._heart.start()
-        orphaned = self._wait_for_the_end()
-        if orphaned:
+        if self._wait_for_the_end():
             self._outlive()
         self._heart.stop()
         self._ended.set()
-        self._door.knock()
-        self._reader.join()
-        self._echoes.put(None)
-        self._echoer.join(TICK_SECONDS)
+        self._taker.join()
+        self._said.put(None)
+        self._speaker.join(TICK_SECONDS)
         self._bus.close()
         return self._writer.close()
 
@@ -106,23 +100,6 @@ class Recorder:
                 return self._ends.get(timeout=TICK_SECONDS)
         return True
 
-    def _read_all(self) -> None:
-        """Takes what processes of this machine send. Between two looks it waits for more: being woken costs most."""
-        while not self._ended.is_set():
-            self._door.look(wait=True)
-            time.sleep(REST_SECONDS)
-        self._door.look(wait=False)
-
-    def _on_delivery(self, packet: Packet) -> None:
-        (self._on_step if packet.key.startswith("s/") else self._on_message)(packet)
-
-    def _on_message(self, packet: Packet) -> None:
-        topic = packet.key.partition("/")[2]
-        if not self._manifest.steps_only and self._take(Envelope, packet):
-            self._tap.pass_on(packet)
-        if packet.genuine and topic in self._manifest.awaited:
-            self._echo(f"a/{topic}", bytes(packet.payload))
-
     def _outlive(self) -> None:
         """The stages die with the supervisor; what they have said until then is recorded."""
         signal.alarm(LAST_RESORT_SECONDS)
@@ -135,72 +112,117 @@ class Recorder:
         vitals = self._writer.vitals()
         return {**vitals, "refused": vitals["refused"] + self._refusals.count}
 
-    def _take(self, kind: Kind, packet: Packet) -> bool:
-        """Records a packet of the run; what strays in is refused. Whether a record is malformed, the writer sees."""
-        if packet.genuine:
-            self._writer.put(kind, packet.payload)
-        else:
-            self._refusals.read(kind, packet)
-        return packet.genuine
+    # ------------------------------------------------------------------------------------------ what is heard
 
-    def _on_log(self, packet: Packet) -> None:
-        self._take(LogLine, packet)
+    def _take_all(self) -> None:
+        """Takes what comes, from time to time: being woken for each costs most."""
+        while not self._ended.wait(REST_SECONDS):
+            self._look()
+        self._look()
 
-    def _on_step(self, packet: Packet) -> None:
-        """Refuses what a process says that was cut off: the others know it as gone, and do its work again."""
-        try:
-            step = unpack(Step, packet.payload)
-        except CodecError:
-            self._take(Step, packet)  # and the writer says what is wrong with it
+    def _look(self) -> None:
+        """Takes what is there; what a process has sent that was seen to go is among it."""
+        with self._changing:
+            gone = [process for process, here in self._lost.items() if not here and process not in self._present]
+            appeared, self._appeared = self._appeared, []
+        for packet in self._heard.take():
+            self._take(packet)
+        for process in appeared:
+            self._redelivery.appeared(process)
+        for process in gone:
+            self._settle(process)
+        self._redelivery.offer_latest()
+
+    def _take(self, packet: Packet) -> None:
+        kind, _, rest = packet.key.partition("/")
+        take = {"m": self._on_message, "s": self._on_step, "l": self._on_log, "x": self._on_lost}.get(kind)
+        if take is not None:
+            take(rest, packet)
+
+    def _on_message(self, topic: str, packet: Packet) -> None:
+        envelope = self._refusals.read(Envelope, packet)
+        if envelope is None:
             return
-        if step.stage != packet.end:
-            wrong = CodecError("Step", "stage", f"expected {packet.end}, got {step.stage[:60]!r}")
+        if not self._manifest.steps_only:
+            self._writer.put(Envelope, packet.payload)
+        for consumer, port in self._redelivery.note_message(topic, envelope.id, packet.payload):
+            self._said.put((f"j/{consumer}", Journal(answered=((port, envelope.id),))))
+
+    def _on_step(self, stage: str, packet: Packet) -> None:
+        """Refuses what a process says that is dead: the others know it as lost, and do its work again."""
+        step = self._refusals.read(Step, packet)
+        if step is None:
+            return
+        if step.stage != stage:
+            wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
-        elif Process(step.stage, step.replica, step.incarnation) not in self._gone and self._take(Step, packet):
-            self._echoes.put(step)
+        elif not self._lost.get(Process(step.stage, step.replica, step.incarnation)):
+            self._writer.put(Step, packet.payload)
+            self._redelivery.note_step(step)
+            self._said.put(step)
+
+    def _on_log(self, _: str, packet: Packet) -> None:
+        self._writer.put(LogLine, packet.payload)
+
+    def _on_lost(self, _: str, packet: Packet) -> None:
+        lost = self._refusals.read(Lost, packet)
+        if lost is not None:
+            self._writer.put(Lost, packet.payload)
+            with self._changing:
+                self._lost.setdefault(Process(lost.stage, lost.replica, lost.incarnation), False)
 
     def _on_presence(self, process: Process, present: bool) -> None:
-        if process.stage != RECORDER:
+        with self._changing:
+            if present and process not in self._present:
+                self._appeared.append(process)
             (self._present.add if present else self._present.discard)(process)
-        if not present:
-            self._door.after_all(lambda: self._bury(process))
 
-    def _bury(self, process: Process) -> None:
-        """What a process has sent straight to here before it died has been taken by now."""
-        self._gone.add(process)
-        self._writer.after_flush(lambda: self._echo(f"gone/{process.path}", b""))
+    def _settle(self, process: Process) -> None:
+        """All that a dead process has sent is here: once it is on the disk too, another one may take its place."""
+        with self._changing:
+            self._lost[process] = True
+            living = list(self._present)
+        self._redelivery.lost(process, living)
+        self._writer.after_flush(lambda: self._said.put((f"settled/{process.path}", b"")))
 
-    def _when_all_is_said(self, answer: Callable[[], None]) -> None:
-        self._door.after_all(lambda: self._echoes.put(answer))
+    # ------------------------------------------------------------------------------------------ what is said
 
-    def _echo(self, key: str, payload: bytes) -> None:
-        self._echoes.put(lambda: self._bus.publish(key, payload))
+    def _send_again(self, key: str, payload: bytes, may_be_dropped: bool) -> None:
+        self._said.put((key, payload) if not may_be_dropped else (key, memoryview(payload)))
 
-    def _echo_all(self) -> None:
+    def _say_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
         while True:
-            first = self._echoes.get()
-            time.sleep(ECHO_REST_SECONDS)
-            echoes = deque([first, *(self._echoes.get() for _ in range(self._echoes.qsize()))])
-            while echoes:
-                echo = echoes.popleft()
-                if echo is None:
+            first = self._said.get()
+            time.sleep(SAY_REST_SECONDS)
+            waiting = deque([first, *(self._said.get() for _ in range(self._said.qsize()))])
+            while waiting:
+                saying = waiting.popleft()
+                if saying is None:
                     return
-                if isinstance(echo, Step):
-                    journal = Journal((echo, *_steps_after(echo, echoes)))
-                    self._bus.publish(f"j/{echo.stage}", pack(journal))
+                if isinstance(saying, Step):
+                    journal = Journal((saying, *_steps_after(saying, waiting)))
+                    self._bus.publish(f"j/{saying.stage}", pack(journal))
                 else:
-                    echo()
+                    self._say(*saying)
+
+    def _say(self, key: str, payload: Journal | bytes | memoryview) -> None:
+        if isinstance(payload, Journal):
+            self._bus.publish(key, pack(payload))
+        else:
+            self._bus.publish(key, bytes(payload), may_be_dropped=isinstance(payload, memoryview))
 
     def _complain(self, text: str) -> None:
-        """Shows a line; it comes back over the bus and is recorded too."""
-        self._bus.publish(f"l/{RECORDER}", pack(LogLine(RECORDER, 0, "error", text, time.time_ns())))
+        """Shows and records a line."""
+        line = pack(LogLine(RECORDER, 0, "error", text, time.time_ns()))
+        self._bus.publish(f"l/{RECORDER}", line)
+        self._writer.put(LogLine, line)
 
 
-def _steps_after(first: Step, echoes: deque[_Echo]) -> Iterator[Step]:
-    """Those of the same stage that follow at once: they are echoed together."""
-    while echoes and isinstance(step := echoes[0], Step) and step.stage == first.stage:
-        echoes.popleft()
+def _steps_after(first: Step, waiting: deque[_Saying]) -> Iterator[Step]:
+    """Those of the same stage that follow at once: they are said together."""
+    while waiting and isinstance(step := waiting[0], Step) and step.stage == first.stage:
+        waiting.popleft()
         yield step
 
 

@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +22,24 @@ from runner.graph.graph import Route, node_from_entry
 from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.message import codec
-from runner.message.codec import CodecError, Draft, Envelope, Journal, LogLine, Outcome, Receipt, Step
-from runner.message.packet import RECORDER, Packet, Process
-from runner.message.refusals import Refusals, admit, require_genuine
+from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, LogLine, Lost, Outcome, Step, answered
+from runner.message.packet import GATEWAY, RECORDER, Packet, Process
+from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, explain_death, volunteer_for_oom
 from runner.process.delivery import Delivery, Stopped
 from runner.process.health import Heart
-from runner.process.inbox import Inbox, Mailbox, Mismatched, Ready
+from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
 from runner.process.past import past_of, relive
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording
-from runner.transport.bus import Bus, Presence
+from runner.transport.bus import Bus, Peers, Presence
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
 REMEMBERED = 10_000
-"""Ids a process remembers per process to recognise what it is sent twice."""
+"""Ids a process remembers to recognise what it is sent twice."""
+RECORDED_SECONDS = 1.0
+"""How long a process that ends waits for the recorder to have its steps."""
 EXIT_FAILED = 1
 EXIT_REFUSED = 2
 
@@ -56,63 +59,61 @@ class Assignment(msgspec.Struct, frozen=True):
     """(stage, replica) of every process that must be there before anything is sent."""
     replica: int = 0
     incarnation: int = 0
+    gateway: str = ""
+    """Where listeners meet the run; empty on other hosts."""
     network: Network | None = None
-    """None on loopback."""
-    secret: str = ""
-    """Of the run's bus."""
+    """None on one machine."""
     past: str = ""
     """Recording from which a stateful stage gets back what its earlier processes knew; empty for others."""
     numbers: dict[str, int] = {}
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
     """True where an earlier process has run the start handlers."""
-    recorded: frozenset[str] = frozenset()
-    """Output ports that the recorder is sent."""
     consumed: tuple[tuple[str, str], ...] = ()
     """(port, id) of the newest that earlier processes have consumed: it may be sent again, and is not worked on."""
+    undone: tuple[tuple[str, str, str], ...] = ()
+    """(consumer, port, id) of the parts that an earlier process has sent and nobody has done with."""
 
 
-class Host:
+class StageProcess:
     """One stage (or replica) between its bus and its handlers."""
 
     def __init__(self, assignment: Assignment):
         """Constructs the stage; raises Refused where its settings do not hold."""
-        self._task = assignment
-        self._node = node_from_entry(assignment.stage, assignment.entry)
+        self._task = task = assignment
+        self._node = node_from_entry(task.stage, task.entry)
         self._stage = self._node.construct()
-        if assignment.past:
-            recording = Recording(Path(assignment.past))
-            steps = past_of(recording, assignment.stage, assignment.incarnation)
-            relive(self._node, self._stage, assignment.seed, recording, steps)
-        self._process = Process(assignment.stage, assignment.replica, assignment.incarnation)
-        self._bus = Bus(
-            assignment.run,
-            connect=assignment.endpoint,
-            network=assignment.network,
-            secret=assignment.secret,
-            process=self._process,
-        )
+        if task.past:
+            recording = Recording(Path(task.past))
+            steps = past_of(recording, task.stage, task.incarnation)
+            relive(self._node, self._stage, task.seed, recording, steps)
+        self._process = Process(task.stage, task.replica, task.incarnation)
+        self._bus = Bus(task.run, task.endpoint, gateway=task.gateway, network=task.network, process=self._process)
         self._presence = Presence()
+        self._peers = Peers()
         self._stopping = threading.Event()
         self._retiring = threading.Event()
-        self._delivery = Delivery(assignment.routes, self._bus.deliver, self._warn, self._stopping.is_set)
+        self._delivery = Delivery(task.routes, self._give, self._warn, self._stopping.is_set, task.undone)
         self._inbox = Inbox(self._node)
         self._executor = Executor(
             self._node,
             self._stage,
-            seed=assignment.seed,
-            directory=Path(assignment.directory),
+            seed=task.seed,
+            directory=Path(task.directory),
             log=self._log,
-            numbers=assignment.numbers,
+            numbers=task.numbers,
         )
-        self._receipts: deque[Receipt] = deque()
-        self._arrived: OrderedDict[tuple[str, str], bool] = OrderedDict()
-        """(port, id) of what has arrived, and whether it is consumed."""
-        self._remember(one for one in assignment.consumed if not self._node.keeps(one[0]))
+        self._arrived: OrderedDict[tuple[str, str], None] = OrderedDict()
+        """(port, id) of what has arrived, so that it is worked on once."""
+        self._remember(one for one in task.consumed if not self._node.keeps(one[0]))
+        self._left: list[tuple[str, str]] = []
+        """(port, id) of what was refused since the last step."""
         self._refusals = Refusals(lambda text: self._log(text, "error"))
         self._mailbox = Mailbox(self._node)
-        self._door = self._bus.open_door(self._mailbox.put, self._refusals.refuse)
+        self._parts = Parts()
         self._steps = 0
+        self._recorded = threading.Condition()
+        self._recorded_steps = 0
         self._present: _Record | None = None
         """The step that runs."""
         self._sent: dict[str, tuple[int, int]] = dict.fromkeys(self._node.type.outputs, (0, 0))
@@ -121,7 +122,7 @@ class Host:
     def run(self) -> None:
         """Serves until it is stopped; raises what a handler raises."""
         self._connect()
-        expected = {*self._task.processes, (RECORDER, 0)}
+        expected = {*self._task.processes, (RECORDER, 0), (GATEWAY, 0)}
         gc.freeze()  # what set-up has made stays: no collection need look at it again
         if self._presence.wait_for(expected, self._stopping.is_set):
             self._start()
@@ -130,24 +131,22 @@ class Host:
     def stop(self) -> None:
         """Ends :meth:`run` after the present step. May be called from a signal handler."""
         self._stopping.set()
-        self._door.knock()
+        self._mailbox.wake()
 
     def retire(self) -> None:
         """Ends :meth:`run` after the whole present step; a successor does the rest. May be called from a signal
         handler.
         """
         self._retiring.set()
-        self._door.knock()
+        self._mailbox.wake()
 
-    def close(self) -> None:
-        """Lets the recorder catch up, then releases the stage and the bus."""
-        if self._retiring.is_set():
-            self._delivery.drain(self._stopping.is_set)
-        else:
-            self._say_what_is_left()
-        self._delivery.close()
+    def close(self, *, failed: bool = False) -> None:
+        """Journals the end, unless the process has ``failed``, and releases the stage and the bus."""
+        if not failed:
+            self._journal_end()
+        with self._recorded:
+            self._recorded.wait_for(lambda: self._recorded_steps >= self._steps, RECORDED_SECONDS)
         self._heart.stop()
-        self._bus.flush()
         self._stage.close()
         self._bus.close()
 
@@ -155,12 +154,16 @@ class Host:
 
     def _connect(self) -> None:
         """Subscribes to everything first and announces this process last: who sees it may send."""
-        for consumer in {route.consumer for route in self._task.routes}:
+        own = f"{self._process.stage}/{self._process.replica}"
+        for consumer in {self._process.stage, *(route.consumer for route in self._task.routes)}:
             self._bus.subscribe(f"j/{consumer}", self._on_journal)
-            self._bus.subscribe(f"r/{consumer}", self._on_receipt)
-        self._bus.subscribe(
-            f"d/{self._process.stage}/{self._process.replica}/*", self._on_delivery, first=self._hand_over
-        )
+        for port, edge in self._node.inputs.items():
+            listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
+            listen(f"m/{edge.stage}/{edge.port}", partial(self._on_message, port))
+        self._bus.hand_over(f"again/{own}/*", lambda packet: self._on_message(packet.end, packet))
+        self._bus.hand_over(f"d/{own}/*", self._on_deal)
+        self._bus.hand_over("e/**", self._on_end)
+        self._bus.subscribe("x/*", self._on_lost)
         self._bus.watch(self._on_presence)
         self._heart.start()
         self._bus.announce()
@@ -187,58 +190,76 @@ class Host:
             print(f"cut off meanwhile, and replaced by incarnation {process.incarnation}", file=sys.stderr, flush=True)
             os._exit(EXIT_FAILED)
         self._presence.update(process, present)
-        self._delivery.update(process, present)
+        if present:
+            self._peers.appeared(process)
+            self._delivery.appeared(process)
+
+    def _on_lost(self, packet: Packet) -> None:
+        lost = self._refusals.read(Lost, packet)
+        if lost is not None:
+            process = Process(lost.stage, lost.replica, lost.incarnation)
+            self._peers.ended(process)
+            self._delivery.lost(process)
+
+    def _on_end(self, packet: Packet) -> None:
+        try:
+            self._peers.ended(Process.of(packet.key))
+        except Refused as refusal:
+            self._refusals.refuse(packet.key, refusal)
 
     def _on_journal(self, packet: Packet) -> None:
-        """A step that was done acknowledges what it consumed; one that failed will be tried again."""
-        journal = self._refusals.read(Journal, packet)
-        for step in journal.steps if journal is not None else ():
-            if step.outcome == "done":
-                self._delivery.acknowledge(step.stage, step.consumed)
+        """What a step has done with is acknowledged by it, once the recorder has the step."""
+        journal, consumer = self._refusals.read(Journal, packet), packet.end
+        if journal is None:
+            return
+        for done in (journal.answered, *map(answered, journal.steps)):
+            self._delivery.answered(consumer, done)
+            if consumer == self._process.stage:
+                self._parts.forget(done)
+        own = [step for step in journal.steps if Process(step.stage, step.replica, step.incarnation) == self._process]
+        if own:
+            with self._recorded:
+                self._recorded_steps = own[-1].number + 1
+                self._recorded.notify_all()
 
-    def _on_receipt(self, packet: Packet) -> None:
-        receipt, consumer = self._refusals.read(Receipt, packet), packet.end
-        if receipt is not None and receipt.consumed:
-            self._delivery.acknowledge(consumer, [(receipt.port, receipt.id)])
-        elif receipt is not None:
-            self._delivery.receive(consumer, receipt.port, receipt.id)
+    def _on_message(self, port: str, packet: Packet) -> None:
+        """Hands what has come to the thread that runs steps; of parts only its own."""
+        if port in self._node.inputs and self._node.shares(port):
+            try:
+                found = self._parts.came(port, codec.unpack(Envelope, packet.payload).id, packet)
+            except CodecError:
+                found = packet  # and who takes it says what is wrong with it
+            if found is None:
+                return
+        self._mailbox.put(port, packet)
 
-    def _hand_over(self, packet: Packet) -> None:
-        """To the thread that runs steps, before anything else is done about it; then comes :meth:`_on_delivery`."""
-        port = packet.end
-        with contextlib.suppress(CodecError):  # what is malformed is refused by who takes it
-            id = admit(Envelope, packet).id
-            self._receipts.append(Receipt(port, id, consumed=self._arrived.get((port, id), False)))
-        self._mailbox.put(packet)
-        self._door.knock()
+    def _on_deal(self, packet: Packet) -> None:
+        deal = self._refusals.read(Deal, packet)
+        if deal is not None and (part := self._parts.deal(packet.end, deal.id)) is not None:
+            self._mailbox.put(packet.end, part)
 
-    def _on_delivery(self, _: Packet) -> None:
-        """Gives receipts at once, however long the present step takes."""
-        while self._receipts:
-            self._give_receipt(self._receipts.popleft())
+    def _give(self, stage: str, replica: int, port: str, id: str) -> None:
+        self._bus.publish(f"d/{stage}/{replica}/{port}", codec.pack(Deal(id)))
 
-    def _give_receipt(self, receipt: Receipt) -> None:
-        self._bus.publish(f"r/{self._process.stage}", codec.pack(receipt))
-
-    def _take(self, packet: Packet) -> None:
+    def _take(self, name: str, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
-        name = packet.end
+        id = ""
         try:
             envelope = codec.unpack(Envelope, packet.payload)
-            if packet.genuine and (name, envelope.id) in self._arrived:
-                if packet.near and self._arrived[name, envelope.id]:
-                    self._give_receipt(Receipt(name, envelope.id, consumed=True))
+            id = envelope.id
+            if (name, id) in self._arrived:
                 return
             port = self._node.type.inputs.get(name)
             if port is None:
                 raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
             travelled = packet.arrived_ns - packet.sent_ns if packet.sent_ns else 0
-            arrival = receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled)
-            require_genuine(packet)
-            self._inbox.add(arrival)
-            self._arrived[name, envelope.id] = False
+            self._inbox.add(receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled))
         except (CodecError, Mismatched) as error:
             self._refusals.refuse(packet.key, error)
+            if id:
+                self._left.append((name, id))
+        if id:
+            self._remember([(name, id)])
 
     # ------------------------------------------------------------------------------------------ steps
 
@@ -260,9 +281,8 @@ class Host:
 
     def _take_all(self, *, wait: bool) -> None:
         """Takes every packet that is there; waits for one if there is nothing else to do."""
-        self._door.look(wait=wait and self._mailbox.empty and not self._inbox.has_ready)
-        for packet in self._mailbox.take():
-            self._take(packet)
+        for port, packet in self._mailbox.take(wait=wait and not self._inbox.has_ready):
+            self._take(port, packet)
 
     def _step(self, ready: Ready) -> None:
         """Runs one handler to its end and journals it."""
@@ -278,7 +298,7 @@ class Host:
             record.outcome = "stopped"
         except Refused as refusal:
             self._refuse_command(record, ready.handler, refusal)
-        except Exception as error:
+        except BaseException as error:  # also who calls sys.exit() in a handler has failed
             record.outcome, record.error = "failed", _summary(error)
             raise
         finally:
@@ -309,30 +329,58 @@ class Host:
             yield True
 
     def _emit(self, draft: Draft) -> None:
-        """Sends a message: to those who wait for it, then to the recorder, also where the graph ends meanwhile."""
-        envelope, payload = draft.cover, self._bus.load(draft.parts())
+        """Sends a message once its consumers have room; also where the graph ends meanwhile."""
+        envelope, payload = draft.cover, b"".join(draft.parts())
         port = envelope.id.partition("#")[0].rpartition(".")[2]
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
+
+        def send() -> None:
+            self._bus.publish(f"m/{self._process.stage}/{port}", payload)
+
         try:
-            self._delivery.publish(port, envelope, payload)
-            os.sched_yield()  # to a consumer that was woken on this processor
-        finally:
-            if port in self._task.recorded:
-                self._bus.deliver((RECORDER, 0), f"m/{self._process.stage}/{port}", payload)
+            self._delivery.publish(port, envelope, send)
+        except Stopped:
+            send()
+            raise
 
     def _journal(self, record: "_Record") -> None:
-        step = record.step(self._process, self._steps)
+        left, self._left = (*self._left, *self._inbox.take_unused()), []
+        self._publish_step(record.step(self._process, self._steps, left))
+
+    def _publish_step(self, step: Step) -> None:
         self._steps += 1
-        if step.outcome == "done":
-            self._remember(step.consumed)
-        payload = codec.pack(step)
-        key = f"s/{self._process.stage}"
+        self._bus.publish(f"s/{self._process.stage}", codec.pack(step))
 
-        def journal() -> None:
-            self._bus.deliver((RECORDER, 0), key, payload)
-
-        self._delivery.after_arrival(step.emitted, journal)
+    def _journal_end(self) -> None:
+        """Says what has come and is left. At the end of the graph that is known once nobody publishes any more."""
+        left: Iterable[tuple[str, str]] = ()
+        if not self._retiring.is_set():
+            self._bus.publish(f"e/{self._process.path}", b"")
+            self._peers.wait_for({edge.stage for edge in self._node.inputs.values()}, self._task.processes)
+            self._take_all(wait=False)
+            self._say_what_is_left()
+            left = (*self._inbox.left(), *self._parts.left())
+        left = (*self._left, *self._inbox.take_unused(), *left)
+        own = self._process
+        self._publish_step(
+            Step(
+                own.stage,
+                own.replica,
+                own.incarnation,
+                self._steps,
+                "",
+                (),
+                (),
+                time.time_ns(),
+                0,
+                0,
+                0,
+                "ended",
+                "",
+                left,
+            )
+        )
 
     def _say_what_is_left(self) -> None:
         """Records what was never worked on."""
@@ -345,9 +393,9 @@ class Host:
     def _skipped(self) -> dict[str, int]:
         return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
 
-    def _remember(self, consumed: Iterable[tuple[str, str]]) -> None:
-        for key in consumed:
-            self._arrived[key] = True
+    def _remember(self, arrived: Iterable[tuple[str, str]]) -> None:
+        for key in arrived:
+            self._arrived[key] = None
         while len(self._arrived) > REMEMBERED:
             self._arrived.popitem(last=False)
 
@@ -402,7 +450,7 @@ class _Record:
             self.emitted.append(draft.cover.id)
             yield draft
 
-    def step(self, process: Process, number: int) -> Step:
+    def step(self, process: Process, number: int, left: tuple[tuple[str, str], ...]) -> Step:
         """The journal's record."""
         arrivals = self._ready.arrivals
         last = max(arrivals, key=lambda arrival: arrival.arrived_ns, default=None)
@@ -420,10 +468,11 @@ class _Record:
             computed_ns=self._computed_ns,
             outcome=self.outcome,
             error=self.error,
+            left=left,
         )
 
 
-def _summary(error: Exception) -> str:
+def _summary(error: BaseException) -> str:
     """An exception in one line: its type, its text and where it was raised."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     place = os.path.relpath(frame.filename)
@@ -441,27 +490,27 @@ def main() -> int:
     signal.signal(signal.SIGTERM, _leave)
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
     try:
-        host = Host(assignment)
+        process = StageProcess(assignment)
     except Refused as refusal:
         return _fail(str(refusal), EXIT_REFUSED)
     except Exception as error:
         traceback.print_exc()
         return _fail(_summary(error), EXIT_FAILED)
-    signal.signal(signal.SIGTERM, lambda *_: host.stop())
-    signal.signal(signal.SIGUSR1, lambda *_: host.retire())
-    return _serve(host)
+    signal.signal(signal.SIGTERM, lambda *_: process.stop())
+    signal.signal(signal.SIGUSR1, lambda *_: process.retire())
+    return _serve(process)
 
 
-def _serve(host: Host) -> int:
+def _serve(process: StageProcess) -> int:
     code = 0
     try:
-        host.run()
+        process.run()
     except Refused as refusal:
         code = _fail(str(refusal), EXIT_REFUSED)
-    except Exception as error:
+    except BaseException as error:
         traceback.print_exc()
         code = _fail(_summary(error), EXIT_FAILED)
-    host.close()
+    process.close(failed=code != 0)
     return code
 
 

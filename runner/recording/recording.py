@@ -15,7 +15,7 @@ import msgspec
 from mcap.records import Channel, Metadata, Schema
 
 from runner.contract import Refused
-from runner.message.codec import CodecError, Envelope, LogLine, Step, unpack
+from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
 from runner.recording.container import Container, Damage, Entry, open_file
 from runner.recording.migrations import migrated
 from runner.recording.provenance import fingerprint
@@ -36,8 +36,10 @@ OPEN_CHUNKS = 8
 """Decompressed chunks kept in memory while messages are looked up by id."""
 
 
-def payload_kind(topic: str) -> type[Envelope] | type[Step] | type[LogLine]:
+def payload_kind(topic: str) -> type[Envelope] | type[Step] | type[LogLine] | type[Lost]:
     """What is recorded under a topic."""
+    if topic.startswith("lost/"):
+        return Lost
     if topic.startswith(JOURNAL):
         return Step
     return LogLine if topic.startswith(LOG) else Envelope
@@ -270,9 +272,12 @@ class Recording:
     def _enter_entry(self, entry: Entry) -> None:
         match unpack(payload_kind(entry.topic), entry.data):
             case Step() as step:
-                self.steps.append(step)
+                if step.handler:
+                    self.steps.append(step)
             case LogLine() as line:
                 self.log.append(line)
+            case Lost():
+                pass
             case Envelope(id=id) as sealed:
                 self.repeated[id] += id in self.messages
                 where = entry.log_time_ns, len(entry.data), entry.offset
@@ -283,7 +288,7 @@ class Recording:
         with open_file(self.path) as file:
             entries = self._container.entries_at(file, offset)
         for entry in entries:
-            if not entry.topic.startswith((JOURNAL, LOG)):
+            if not entry.topic.startswith((JOURNAL, LOG, "lost/")):
                 with contextlib.suppress(CodecError):  # noted as damage when the file was read
                     sealed = migrated(unpack(Envelope, entry.data))
                     envelopes.setdefault(sealed.id, sealed)

@@ -17,8 +17,9 @@ import msgspec
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Message, Refused
+from runner.graph.graph import Destination
 from runner.graph.placement import Network
-from runner.message.codec import CodecError, Envelope, LogLine, Step, json_schema, unpack
+from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.recording.container import hold
 from runner.recording.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
 from runner.recording.recording import (
@@ -45,7 +46,7 @@ BACKLOG_BYTES = 2**30
 CACHED_BYTES = 2**25
 """Newest part of a recording that the system keeps in memory, for those who read it as it grows."""
 
-Kind = type[Envelope] | type[Step] | type[LogLine]
+Kind = type[Envelope] | type[Step] | type[LogLine] | type[Lost]
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -69,14 +70,14 @@ class Manifest(msgspec.Struct, frozen=True):
     """``--set`` assignments, as typed."""
     topics: dict[str, Topic]
     """By topic, ``stage/port``."""
+    gateway: str = ""
+    """Where listeners meet the run."""
     network: Network | None = None
-    """None on loopback."""
-    secret: str = ""
-    """Of the run's bus."""
+    """None on one machine."""
     steps_only: bool = False
     """Record no messages."""
-    awaited: tuple[str, ...] = ()
-    """Topics that the supervisor waits for: they are passed on to it."""
+    destinations: dict[str, tuple[Destination, ...]] = {}
+    """Where messages go, by topic."""
 
 
 def topic(kind: type[Message]) -> Topic:
@@ -278,6 +279,8 @@ class RecordingWriter:
             case Step():
                 self._ledger.step(record)
                 self._add(JOURNAL + record.stage, "Step", payload, record.time_ns, record.number)
+            case Lost():
+                self._add("lost/" + record.stage, "Lost", payload, record.time_ns, 0)
             case LogLine():
                 self._add(LOG + record.stage, "LogLine", payload, record.time_ns, 0)
 
@@ -322,4 +325,4 @@ def _create(path: Path) -> IO[bytes]:
     return file
 
 
-_SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, LogLine)}
+_SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, Lost, LogLine)}

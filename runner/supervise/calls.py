@@ -188,7 +188,7 @@ class Calls:
         wanted = {f"{call.stage}.{answer}" for answer in call.answers}
         answers = [id for id in step.emitted if id.partition("#")[0] in wanted]
         call.payload = self._answers.get(answers[0], b"") if answers else b""
-        call.done = not call.answers or bool(answers) or bool(call.step.error)
+        call.done = not call.answers or bool(call.payload) or bool(call.step.error)
 
 
 # ------------------------------------------------------------------------------------------ types of commands

@@ -1,20 +1,26 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
-import contextlib
 import signal
 import subprocess
 import time
-from collections import deque
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.graph.graph import Limits
 from runner.hosts.head import RemoteChild
-from runner.message.codec import Pulse, Step
+from runner.message.codec import Pulse, Step, answered
 from runner.message.packet import Process
 from runner.process.children import ending, last_lines, signal_group
 from runner.process.health import Watch, gigabytes, oom_kills
 from runner.process.step import sequence_of
+
+LOOK_SECONDS = 0.01
+REMEMBERED = 10_000
+"""Messages of which it is known that a stage has done with them."""
+RESENT = 1000
+"""Those that a successor is told."""
 
 
 @dataclass(slots=True)
@@ -42,8 +48,12 @@ class Child:
     condemned: str = ""
     """Why the supervisor kills it."""
     dies_at: float = float("inf")
-    heir: tuple[str, int] | None = None
+    successor: tuple[str, int] | None = None
     """Once it is dead: why it is replaced, and how often it has crashed by now."""
+    reported: bool = False
+    """Whether everybody has been told that it is dead."""
+    unheard_since: float = float("inf")
+    """When its link went, on another host."""
 
     def reason(self, newest: Pulse | None = None) -> str:
         """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
@@ -58,33 +68,63 @@ class Child:
         return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
 
 
-@dataclass(slots=True)
 class Progress:
     """How far a stage has come: what its next process must know."""
 
-    numbers: dict[str, int] = field(default_factory=dict[str, int])
-    consumed: deque[tuple[str, str]] = field(default_factory=lambda: deque[tuple[str, str]](maxlen=1000))
-    started: bool = False
+    def __init__(self, shared: frozenset[tuple[str, str, str]]):
+        """``shared`` are the (output, consumer, port) of edges whose messages are dealt to replicas."""
+        self.numbers: dict[str, int] = {}
+        """Next sequence number by output port."""
+        self.started = False
+        self.undone: dict[tuple[str, str, str], None] = {}
+        """(consumer, port, id) of parts that were sent and not done with."""
+        self._shared = shared
+        self._consumed: OrderedDict[tuple[str, str], None] = OrderedDict()
 
-    def note(self, step: Step) -> None:
+    @property
+    def newest_consumed(self) -> tuple[tuple[str, str], ...]:
+        """(port, id) of what may come once more."""
+        return tuple(self._consumed)[-RESENT:]
+
+    def has_done(self, port: str, id: str) -> bool:
+        """Whether the stage has done with a message lately."""
+        return (port, id) in self._consumed
+
+    def note(self, step: Step, consumers: Mapping[str, "Progress"]) -> None:
         """Takes a step that the recorder has; only what was done counts."""
+        for key in answered(step):
+            self._consumed[key] = None
+            if len(self._consumed) > REMEMBERED:
+                self._consumed.popitem(last=False)
         if step.outcome != "done":
             return
         self.started |= not step.consumed
-        self.consumed.extend(step.consumed)
-        for message_id in step.emitted:
-            port = message_id.partition("#")[0].rpartition(".")[2]
-            self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(message_id) + 1)
+        for id in step.emitted:
+            port = id.partition("#")[0].rpartition(".")[2]
+            self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(id) + 1)
+            for output, consumer, input in self._shared:
+                if output == port and not consumers[consumer].has_done(input, id):
+                    self.undone[consumer, input, id] = None
 
 
-def end_all(children: list[Child], grace_seconds: float) -> None:
+def signal_all(children: Iterable[Child], signum: signal.Signals) -> None:
+    """Signals processes with all that they have started."""
+    for child in children:
+        signal_group(child.handle, signum)
+
+
+def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child], bool] = lambda _: False) -> None:
+    """Waits until each has ended, or where that is ``enough``; not for longer than some seconds."""
+    deadline = time.monotonic() + seconds
+    for child in children:
+        while child.handle.poll() is None and not enough(child) and time.monotonic() < deadline:
+            time.sleep(LOOK_SECONDS)
+
+
+def end_all(children: Sequence[Child], grace_seconds: float) -> None:
     """Asks children to end, kills those that do not, and whatever they have left behind."""
+    signal_all(children, signal.SIGTERM)
+    wait_for(children, grace_seconds)
+    signal_all(children, signal.SIGKILL)
     for child in children:
-        signal_group(child.handle, signal.SIGTERM)
-    deadline = time.monotonic() + grace_seconds
-    for child in children:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.handle.wait(max(0.0, deadline - time.monotonic()))
-    for child in children:
-        signal_group(child.handle, signal.SIGKILL)
         child.handle.wait()

@@ -2,20 +2,19 @@
 
 import signal
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from runner.contract import Level, Refused, Restarted
 from runner.graph.document import suggest
-from runner.graph.graph import SUPERVISOR
+from runner.graph.graph import SUPERVISOR, Graph
 from runner.hosts.head import Hosts
-from runner.message.codec import Pulse, Step
+from runner.message.codec import Pulse, Step, answered
 from runner.message.packet import RECORDER, Process
-from runner.process.children import DUMP, behind, last_lines
+from runner.process.children import DUMP, behind, last_lines, signal_group
 from runner.process.health import Pulses, Watch
 from runner.process.stage_process import EXIT_REFUSED
-from runner.supervise.child import Child, Progress, end_all
+from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Rates
 from runner.terminal import Terminal
@@ -23,6 +22,12 @@ from runner.transport.bus import Presence
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
+END_GRACE_SECONDS = 10.0
+"""What a stage that has finished its step may take until the recorder has what it says."""
+ECHO_SECONDS = 1.0
+"""How long the recorder may take to tell of a step."""
+UNHEARD_SECONDS = 2.0
+"""How long a process on another host may be without a link before it is given up and replaced."""
 RECORDER_GRACE_SECONDS = 30.0
 """What the recorder may take to write what waits for the disk."""
 TICK_SECONDS = 0.05
@@ -56,24 +61,31 @@ class Guardian:
         *,
         say: Callable[[str, Level], None],
         announce: Callable[[Restarted], None],
+        declare_lost: Callable[[Process, str], None],
     ):
-        """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced."""
+        """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced, and
+        ``declare_lost`` everybody that it is dead."""
         self._run = run
         self._graph = run.graph
         self._hosts = hosts
         self._terminal = terminal
         self._say = say
         self._announce = announce
+        self._declare_lost = declare_lost
         self._launch = Launcher(run, hosts)
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
-        self._progress: dict[str, Progress] = defaultdict(Progress)
+        self._progress = {stage: Progress(_shared(run.graph, stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
         self._presence = Presence()
         self._pulses = Pulses()
         self._rates = Rates()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
+        self._quiet: set[Process] = set()
+        """Those that publish no messages any more."""
+        self._ended: set[Process] = set()
+        """Those that have journalled their end."""
         self._absent = set(run.graph.processes())
         self._was_ready = False
 
@@ -100,8 +112,8 @@ class Guardian:
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
-            elif child.heir is not None:
-                self._succeed(child, *child.heir)
+            elif child.successor is not None:
+                self._start_successor(child, *child.successor)
             elif (end := self._replace(child)) is not None:
                 return end
         return None if self._hosts is None else self._look_after_hosts(self._hosts)
@@ -109,19 +121,50 @@ class Guardian:
     def name_the_dead(self) -> None:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
-            if child.handle.poll() and child.heir is None:
+            if child.handle.poll() and child.successor is None:
                 reason = child.reason(self._pulses.of(child.process))
                 self._say(f"{self._name(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
-    def end(self) -> str:
-        """Ends the stages, then the recorder and the viewer, then what they left; returns the recorder's verdict."""
-        end_all(list(self._children.values()), STAGE_GRACE_SECONDS)
+    def end(self) -> None:
+        """Ends the stages: each says what it leaves once nobody publishes any more. Says which are killed."""
+        children = list(self._children.values())
+        signal_all(children, signal.SIGTERM)
+        wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self._quiet)
+        for child in children:
+            if child.handle.poll() is None and child.process not in self._quiet:
+                child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
+                signal_group(child.handle, signal.SIGKILL)
+                child.handle.wait()
+            self._report_lost(child)
+        wait_for(children, END_GRACE_SECONDS)
+        signal_all(children, signal.SIGKILL)
+        for child in children:
+            child.handle.wait()
+            self._report_lost(child)
+
+    def end_recorder(self) -> str:
+        """Ends the recorder and the viewer, then what the stages have left; returns the recorder's verdict."""
         end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
         end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
+
+    def _report_lost(self, child: Child) -> None:
+        """Says that a process has ended without having journalled that."""
+        if child.handle.poll() is None or child.reported:
+            return
+        if child.handle.returncode == 0 and not child.condemned and child.announced:
+            deadline = time.monotonic() + ECHO_SECONDS
+            while child.process not in self._ended and time.monotonic() < deadline:
+                time.sleep(TICK_SECONDS / 5)
+        if child.process not in self._ended:
+            self._lose(child, child.reason(self._pulses.of(child.process)))
+
+    def _lose(self, child: Child, reason: str) -> None:
+        child.reported = True
+        self._declare_lost(child.process, reason)
 
     @property
     def complete(self) -> bool:
@@ -132,7 +175,17 @@ class Guardian:
 
     def note_step(self, step: Step) -> None:
         """Takes a step that the recorder has."""
-        self._progress[step.stage].note(step)
+        process = Process(step.stage, step.replica, step.incarnation)
+        if step.outcome == "ended":
+            self._ended.add(process)
+        self._progress[step.stage].note(step, self._progress)
+        for port, id in answered(step):
+            if (edge := self._graph.nodes[step.stage].inputs.get(port)) is not None:
+                self._progress[edge.stage].undone.pop((step.stage, port, id), None)
+
+    def note_quiet(self, process: Process) -> None:
+        """Takes note of a process that publishes no more."""
+        self._quiet.add(process)
 
     def note_pulse(self, pulse: Pulse, arrived_ns: int) -> None:
         """Takes a sign of life."""
@@ -146,9 +199,11 @@ class Guardian:
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""
         self._presence.update(process, present)
-        if not present:
-            return
         child = self._children.get((process.stage, process.replica))
+        if not present:
+            if self._hosts is not None and child is not None and child.process == process:
+                child.unheard_since = time.monotonic()
+            return
         if self._recorder is not None and process == self._recorder.process:
             self._recorder.announced = True
         elif child is not None and child.process == process:
@@ -241,6 +296,8 @@ class Guardian:
             child.condemned, child.dies_at = fault, now + DUMP_SECONDS
             self._say(f"{name} is killed: {fault}", "warning")
             child.handle.send_signal(DUMP)
+        if not child.condemned and now > child.unheard_since + UNHEARD_SECONDS:
+            child.condemned, child.dies_at = "cut off: the run does not hear it any more", now
         if now > min(child.dies_at, child.retires_by or child.dies_at):
             child.handle.send_signal(signal.SIGKILL)
 
@@ -252,7 +309,7 @@ class Guardian:
             return End(EXIT_REFUSED, f"{name}: {reason}")
         if child.retires_by is not None and not child.condemned:
             self._say(f"{name} was {ASKED}", "info")
-            self._mourn(child, ASKED, child.crashes)
+            self._give_up(child, ASKED, child.crashes)
             return None
         absent, budget = (process.stage, process.replica) in self._absent, self._budget(process.stage)
         if absent or child.crashes >= budget:
@@ -260,7 +317,7 @@ class Guardian:
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
         self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")
         self._show_output(child)
-        self._mourn(child, reason, child.crashes + 1)
+        self._give_up(child, reason, child.crashes + 1)
         return None
 
     def _budget(self, stage: str) -> int:
@@ -268,14 +325,15 @@ class Guardian:
         forgets = self._run.steps_only and self._run.remembers(stage)
         return 0 if forgets else self._graph.nodes[stage].restarts
 
-    def _mourn(self, child: Child, reason: str, crashes: int) -> None:
-        """Tells everybody that a process is replaced. What it leaves behind must be known first."""
-        child.heir, child.dies_at = (reason, crashes), time.monotonic()
+    def _give_up(self, child: Child, reason: str, crashes: int) -> None:
+        """Tells everybody that a process is dead and will be replaced."""
+        child.successor, child.dies_at = (reason, crashes), time.monotonic()
+        self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
         if left := self._launch.end_rest(child.process):
             self._say(f"{self._name(child.process)} {behind(left)}", "warning")
 
-    def _succeed(self, child: Child, reason: str, crashes: int) -> None:
+    def _start_successor(self, child: Child, reason: str, crashes: int) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
         waits = child.announced and process not in self._settled
@@ -291,3 +349,7 @@ class Guardian:
 
     def _name(self, process: Process) -> str:
         return self._run.name_of(process.stage, process.replica)
+
+
+def _shared(graph: Graph, stage: str) -> frozenset[tuple[str, str, str]]:
+    return frozenset((route.output, route.consumer, route.input) for route in graph.routes(stage) if route.shared)

@@ -27,13 +27,13 @@ class Run:
     settings: tuple[str, ...]
     """``--set`` assignments, as typed."""
     endpoint: str
+    """Where all of its processes meet."""
+    gateway: str
+    """Where listeners meet it."""
     network: Network | None
-    """None on loopback."""
-    secret: str
+    """None on one machine."""
     steps_only: bool
     """Record no messages."""
-    awaited: tuple[str, ...]
-    """Topics that the recorder passes on to the supervisor."""
 
     @property
     def directory(self) -> Path:
@@ -53,11 +53,6 @@ class Run:
         """Whether a successor must learn from the recording what its predecessor knew."""
         kind = self.graph.nodes[stage].type.cls
         return kind.stateful and not kind.device
-
-    def recorded(self, stage: str) -> frozenset[str]:
-        """Output ports of which the recorder gets every message."""
-        ports = frozenset(self.graph.outputs_of(stage))
-        return ports & {topic.partition("/")[2] for topic in self.awaited} if self.steps_only else ports
 
 
 class Launcher:
@@ -84,10 +79,10 @@ class Launcher:
             graph_to_json(run.graph),
             run.settings,
             topics,
+            gateway=run.gateway,
             network=run.network,
-            secret=run.secret,
             steps_only=run.steps_only,
-            awaited=run.awaited,
+            destinations=run.graph.destinations(),
         )
         return self._spawn(Process(RECORDER, 0), "runner.process.recorder", msgspec.json.encode(task))
 
@@ -128,10 +123,10 @@ class Launcher:
             incarnation=process.incarnation,
             numbers=progress.numbers,
             started=progress.started,
-            consumed=tuple(progress.consumed),
-            recorded=run.recorded(process.stage),
+            consumed=progress.newest_consumed,
+            undone=tuple(progress.undone),
+            gateway=run.gateway,
             network=run.network,
-            secret=run.secret,
             past=str(run.recording.absolute()) if relives else "",
         )
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 import msgspec
 
 from runner.contract import Refused
-from runner.graph.placement import Network
 from runner.recording.container import hold, is_being_written
+from runner.transport.session import remove_sockets, runtime_folder
 
 
 class Entry(msgspec.Struct, frozen=True):
     """What the live tools must know to reach a run."""
 
     run: str
-    endpoint: str
+    gateway: str
+    """Where tools meet it: a socket of this user."""
     pid: int
     """Of the supervisor."""
     graph: str
@@ -27,10 +29,6 @@ class Entry(msgspec.Struct, frozen=True):
     """Path of the file that is being written."""
     started: float
     """Seconds since the epoch."""
-    secret: str = ""
-    """What those who ask show that they may: only this user can read it."""
-    network: Network | None = None
-    """What the run's network asks of its peers; None on loopback."""
 
 
 class Registration:
@@ -38,7 +36,7 @@ class Registration:
 
     def __init__(self, entry: Entry, folder: Path | None = None) -> None:
         """Raises Refused where the folder cannot be made or is not this user's alone."""
-        self._path = (folder or registry_folder()) / f"{entry.run}.json"
+        self._path = (folder or runtime_folder()) / f"{entry.run}.json"
         unlisted = self._path.with_suffix(f".{os.getpid()}")
         self._file: IO[bytes] = unlisted.open("wb")
         hold(self._file)
@@ -58,24 +56,17 @@ class Registration:
         self._file.close()
 
 
-def registry_folder() -> Path:
-    """The folder of the entries; raises Refused where others could write to it."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    usable = bool(runtime) and os.access(runtime, os.W_OK | os.X_OK)  # another user's after `su`, or gone
-    folder = Path(runtime) / "runner" if usable else Path(f"/tmp/runner-{os.getuid()}")
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-    except OSError as error:
-        raise Refused(f"{folder}: the list of runs cannot be kept there: {error.strerror}") from None
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise Refused(f"{folder}: must be a folder that only this user may enter; type: rm -rf {folder}")
-    return folder
+@contextlib.contextmanager
+def naming() -> Iterator[None]:
+    """Held by who chooses the name of a run and lists it: two that start together get different ones."""
+    with (runtime_folder() / "naming").open("wb") as file:
+        hold(file)
+        yield
 
 
 def runs(folder: Path | None = None) -> list[Entry]:
     """Every run that lives, oldest first; what dead ones have left is cleaned up."""
-    found = [_read(path) for path in sorted((folder or registry_folder()).iterdir())]
+    found = [_read(path) for path in sorted((folder or runtime_folder()).iterdir())]
     return sorted((entry for entry in found if entry is not None), key=lambda entry: entry.started)
 
 
@@ -105,9 +96,13 @@ def _read(path: Path) -> Entry | None:
         return None
     try:
         with path.open("rb") as file:
-            if is_being_written(file):
-                return msgspec.json.decode(file.read(), type=Entry)
+            entry, lives = msgspec.json.decode(file.read(), type=Entry), is_being_written(file)
+        if lives:
+            return entry
         path.unlink(missing_ok=True)
-    except (OSError, msgspec.MsgspecError):
-        pass
+        remove_sockets(entry.gateway)
+    except OSError:
+        pass  # it has just gone
+    except msgspec.MsgspecError:
+        path.unlink(missing_ok=True)
     return None

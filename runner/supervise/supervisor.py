@@ -4,12 +4,11 @@ import contextlib
 import itertools
 import os
 import queue
-import secrets
 import signal
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -22,18 +21,18 @@ from runner.hosts.head import Hosts
 from runner.inspect.info import stage_times
 from runner.inspect.skipped import skipped
 from runner.message import codec
-from runner.message.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step
-from runner.message.packet import RECORDER, Packet, Process
-from runner.message.refusals import Refusals, admit, require_genuine
+from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
+from runner.message.packet import GATEWAY, Packet, Process
+from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
-from runner.supervise.guardian import TICK_SECONDS, End, Guardian
+from runner.supervise.guardian import ECHO_SECONDS, TICK_SECONDS, End, Guardian
 from runner.supervise.launch import Run
-from runner.supervise.registry import Entry, Registration, runs
+from runner.supervise.registry import Entry, Registration, naming, runs
 from runner.supervise.status import RunStatus, topics_of
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
-from runner.transport.session import free_endpoint
+from runner.transport.session import Gateway, new_endpoint, remove_sockets
 
 EXIT_INCOMPLETE = 3
 
@@ -60,41 +59,38 @@ class Supervisor:
         self._terminal = terminal
         self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._calls = Calls(graph, self._publish)
-        id, recording = _new_recording(recordings, graph.name)
-        self._run = run = Run(
-            id,
-            graph,
-            recording,
-            settings,
-            endpoint=self._hosts.endpoint if self._hosts else free_endpoint(),
-            network=self._hosts.network if self._hosts else None,
-            secret=secrets.token_hex(16),
-            steps_only=steps_only,
-            awaited=tuple(self._awaited()),
-        )
-        listen, connect = (self._hosts.listen(), run.endpoint) if self._hosts else (run.endpoint, None)
-        own = Process(SUPERVISOR, 0)
-        self._bus = Bus(run.id, listen=listen, connect=connect, network=run.network, secret=run.secret, process=own)
-        self._entry = Entry(
-            run=run.id,
-            endpoint=listen or run.endpoint,
-            pid=os.getpid(),
-            graph=str(file.absolute()),
-            recording=str(run.recording.absolute()),
-            started=time.time(),
-            secret=run.secret,
-            network=run.network,
-        )
-        self._registration = Registration(self._entry)
+        endpoint, network = (self._hosts.endpoint, self._hosts.network) if self._hosts else (new_endpoint(), None)
+        gateway = new_endpoint(endpoint if network is None else "")
+        with naming():
+            id, recording = _new_recording(recordings, graph.name)
+            self._entry = Entry(
+                run=id,
+                gateway=gateway,
+                pid=os.getpid(),
+                graph=str(file.absolute()),
+                recording=str(recording.absolute()),
+                started=time.time(),
+            )
+            self._registration = Registration(self._entry)
+        self._run = run = Run(id, graph, recording, settings, endpoint, gateway, network, steps_only)
+        self._own = Process(SUPERVISOR, 0)
+        self._bus = Bus(id, endpoint, network=network, process=self._own, listen=network is None)
+        self._gateway = Gateway(gateway, endpoint, network, graph.listen)
+        self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
-        self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.deliver, self._warn, self._stopping.is_set)
+        self._delivery = Delivery(graph.routes(SUPERVISOR), self._give, self._warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
         self._steps: list[Step] = []
         self._refusals = Refusals(self._complain)
-        self._guardian = Guardian(run, self._hosts, terminal, say=self._say, announce=self._publish_restart)
+        self._guardian = Guardian(
+            run, self._hosts, terminal, say=self._say, announce=self._publish_restart, declare_lost=self._declare_lost
+        )
         self._numbers: dict[str, int] = defaultdict(int)
         """Next sequence number by output port of the supervisor."""
         self._numbering = threading.Lock()
+        self._own_steps = 0
+        self._has_ended = threading.Event()
+        """Once the recorder has the supervisor's last step."""
 
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
@@ -102,7 +98,7 @@ class Supervisor:
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
         self._connect()
-        self._terminal.show(SUPERVISOR, f"run {self._run.id} on {self._run.endpoint}")
+        self._terminal.show(SUPERVISOR, f"run {self._run.id} on {self._graph.listen or self._run.gateway}")
         try:
             self._guardian.start_recorder(view=view)
             if self._hosts is not None:
@@ -127,43 +123,36 @@ class Supervisor:
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _connect(self) -> None:
-        for consumer in {route.consumer for route in self._graph.routes(SUPERVISOR)}:
-            self._bus.subscribe(f"r/{consumer}", self._on_receipt)
-        self._bus.subscribe("j/*", self._on_journal)
-        self._bus.subscribe("l/*", self._on_log)
-        self._bus.subscribe(f"a/*/{FINISHED}", self._on_finished)
-        self._bus.subscribe("gone/**", self._on_gone)
-        self._bus.subscribe("h/**", self._on_pulse)
+        subscribe = self._bus.subscribe
+        subscribe("j/*", self._on_journal)
+        subscribe("l/*", self._on_log)
+        subscribe(f"m/*/{FINISHED}", self._on_finished)
+        subscribe("settled/**", lambda packet: self._on_word(packet, self._guardian.note_settled))
+        subscribe("e/**", lambda packet: self._on_word(packet, self._guardian.note_quiet))
+        subscribe("h/**", self._on_pulse)
         for key in self._calls.answer_keys:
-            self._bus.subscribe(f"a/{key}", self._on_answer)
+            subscribe(f"m/{key}", self._on_answer)
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
 
-    def _awaited(self) -> Iterator[str]:
-        """Topics that are passed on to here: the end, and answers to calls."""
-        for stage in self._graph.nodes:
-            if FINISHED in self._graph.outputs_of(stage):
-                yield f"{stage}/{FINISHED}"
-        yield from self._calls.answer_keys
-
     def _on_journal(self, packet: Packet) -> None:
         journal = self._refusals.read(Journal, packet)
-        for step in journal.steps if journal is not None else ():
-            self._guardian.note_step(step)
-            self._steps.append(step)
-            if step.outcome == "done":
-                self._delivery.acknowledge(step.stage, step.consumed)
+        if journal is None:
+            return
+        self._delivery.answered(packet.end, journal.answered)
+        for step in journal.steps:
+            self._delivery.answered(step.stage, answered(step))
+            if step.stage in self._graph.nodes:
+                self._guardian.note_step(step)
+                self._steps.append(step)
                 self._calls.note_step(step)
+            elif step.outcome == "ended":
+                self._has_ended.set()
 
     def _on_answer(self, packet: Packet) -> None:
         envelope = self._refusals.read(Envelope, packet)
         if envelope is not None:
-            self._calls.note_answer(envelope.id, bytes(packet.payload))
-
-    def _on_receipt(self, packet: Packet) -> None:
-        receipt = self._refusals.read(Receipt, packet)
-        if receipt is not None and receipt.consumed:
-            self._delivery.acknowledge(packet.end, [(receipt.port, receipt.id)])
+            self._calls.note_answer(envelope.id, packet.payload)
 
     def _on_log(self, packet: Packet) -> None:
         line = self._refusals.read(LogLine, packet)
@@ -174,18 +163,18 @@ class Supervisor:
 
     def _on_finished(self, packet: Packet) -> None:
         try:
-            finished = codec.open_envelope(Finished, admit(Envelope, packet))
+            finished = codec.open_envelope(Finished, codec.unpack(Envelope, packet.payload))
         except CodecError as error:
             self._refusals.refuse(packet.key, error)
         else:
             self._events.put(End(finished.code, finished.reason))
 
-    def _on_gone(self, packet: Packet) -> None:
+    def _on_word(self, packet: Packet, note: Callable[[Process], None]) -> None:
+        """What is said of the process that a key names."""
         try:
-            require_genuine(packet)
-            self._guardian.note_settled(Process.of(packet.key))
-        except (CodecError, Refused) as error:
-            self._refusals.refuse(packet.key, error)
+            note(Process.of(packet.key))
+        except Refused as refusal:
+            self._refusals.refuse(packet.key, refusal)
 
     def _on_pulse(self, packet: Packet) -> None:
         pulse = self._refusals.read(Pulse, packet)
@@ -193,7 +182,8 @@ class Supervisor:
             self._guardian.note_pulse(pulse, packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
-        self._delivery.update(process, present)
+        if present:
+            self._delivery.appeared(process)
         self._guardian.note_presence(process, present)
 
     # ------------------------------------------------------------------------------------------ what is published
@@ -209,8 +199,25 @@ class Supervisor:
         say(own)
         envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
         payload = codec.pack(envelope)
-        self._bus.deliver((RECORDER, 0), f"m/{SUPERVISOR}/{port}", payload)
-        self._delivery.publish(port, envelope, payload)
+        try:
+            self._delivery.publish(port, envelope, lambda: self._bus.publish(f"m/{SUPERVISOR}/{port}", payload))
+        finally:
+            self._journal((own,))
+
+    def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
+        with self._numbering:
+            step = Step(SUPERVISOR, 0, 0, self._own_steps, "", (), emitted, time.time_ns(), 0, 0, 0, outcome)
+            self._own_steps += 1
+            self._bus.publish(f"s/{SUPERVISOR}", codec.pack(step))
+
+    def _declare_lost(self, process: Process, reason: str) -> None:
+        """Tells everybody that a process is dead, and deals its parts to others."""
+        lost = Lost(process.stage, process.replica, process.incarnation, reason, time.time_ns())
+        self._bus.publish(f"x/{process.stage}", codec.pack(lost))
+        self._delivery.lost(process)
+
+    def _give(self, stage: str, replica: int, port: str, id: str) -> None:
+        self._bus.publish(f"d/{stage}/{replica}/{port}", codec.pack(Deal(id)))
 
     # ------------------------------------------------------------------------------------------ the end
 
@@ -218,9 +225,15 @@ class Supervisor:
         """Ends all processes and what connects them, and returns the recorder's verdict."""
         self._stopping.set()
         self._calls.close()
-        verdict = self._guardian.end()
+        self._bus.publish(f"e/{self._own.path}", b"")
+        self._guardian.end()
+        self._journal((), "ended")
+        self._has_ended.wait(ECHO_SECONDS)
+        verdict = self._guardian.end_recorder()
+        self._gateway.close()
         self._bus.close()
         self._registration.close()
+        remove_sockets(self._run.gateway)
         return verdict
 
     def _conclude(self, end: End, verdict: str) -> End:
@@ -264,7 +277,7 @@ class Supervisor:
             run=self._run.id,
             graph=self._entry.graph,
             recording=self._entry.recording,
-            endpoint=self._run.endpoint,
+            endpoint=self._graph.listen or self._run.gateway,
             started=self._entry.started,
             ready=not self._guardian.awaited(),
             processes=self._guardian.status(),

@@ -1,28 +1,23 @@
-"""The transport: a Zenoh session on loopback, its keys, and who is present.
+"""One process' way to the others of its run: what it publishes, hears, asks and answers, and who is present.
 
-=========================================  ====================================================================
-``RUN/m/STAGE/PORT``                       every message once (Envelope), for the recorder
-``RUN/d/STAGE/REPLICA/PORT``               the same bytes, delivered to one consumer's input port
-``RUN/s/STAGE``                            a step that was done (Step), for the recorder
-``RUN/j/STAGE``                            journal: the recorder's echo of steps; what they consumed is done with
-``RUN/a/STAGE/PORT``                       the recorder's echo of messages that the supervisor waits for
-``RUN/gone/STAGE/REPLICA/INCARNATION``     the recorder's word that it has all that a dead process has sent
-``RUN/r/STAGE``                            what has arrived at a consumer (Receipt)
-``RUN/l/STAGE``                            log lines (LogLine)
-``RUN/h/STAGE/REPLICA``                    a sign of life twice a second (Pulse); not recorded
-``RUN/present/STAGE/REPLICA/INCARNATION``  liveliness token, declared after the process' subscribers; ends with /BADGE
-``RUN/flush``                              query answered by the recorder once it has everything sent before
-``RUN/q/NAME``                             question to the supervisor (status, down, restart, call), answered in JSON
-=========================================  ====================================================================
+Below the name of the run stand the keys, of which a stranger may hear all (docs/keys.md):
 
-What is for one process (``m``, ``d`` and ``s``) goes straight to it where it runs on the same machine, see
-:mod:`runner.transport.links`, under the same key.
+==========================================  ==================================================================
+``m/STAGE/PORT``                            every message, once (Envelope)
+``s/STAGE``                                 a step that was taken (Step)
+``l/STAGE``                                 log lines (LogLine)
+``x/STAGE``                                 the supervisor's word that a process is dead (Lost)
+``j/STAGE``                                 journal: steps that the recorder has; what they consumed is done with
+``d/STAGE/REPLICA/PORT``                    which of the parts on ``m`` this replica is to work on (Deal)
+``again/STAGE/REPLICA/PORT``                from the recorder: a message that this process may have missed
+``e/STAGE/REPLICA/INCARNATION``             this process will publish no messages any more
+``settled/STAGE/REPLICA/INCARNATION``       the recorder has on the disk all that a dead process has sent
+``h/STAGE/REPLICA``                         a sign of life twice a second (Pulse)
+``present/STAGE/REPLICA/INCARNATION``       liveliness token, declared after the process' subscribers
+``q/NAME``                                  question to the supervisor (status, down, restart, call), answered in JSON
+==========================================  ==================================================================
 
-Links keep their order, so that a step that the recorder has is there with everything it emitted. A process that is
-killed may have reached some peers and not others: what the recorder has is what counts, for everybody.
-
-A message may be published on its ``m`` key twice, with equal bytes, when its publisher crashed before the step
-was journalled or its part was handed to another replica: readers tell by the id.
+Links keep their order: who has a step has what it emitted.
 """
 
 from __future__ import annotations
@@ -37,35 +32,30 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import zenoh
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, FifoChannel
 
 from runner.contract import Refused
+from runner.graph.graph import SUPERVISOR
 from runner.graph.placement import Network
-from runner.message.packet import Packet, Process, badge
-from runner.transport.arena import Block, Store
-from runner.transport.links import INLINE_BYTES, Door, Link, address_of
-from runner.transport.session import close_dead_links_at_once, open_session
+from runner.message.packet import Packet, Process
+from runner.transport.session import close_dead_links_at_once, new_endpoint, open_session, private
 
 A = TypeVar("A")
 
-REST_SECONDS = 0.001
-"""How long callbacks wait for others to be called with."""
-FLUSH_SECONDS = 1.0
+CLOSE_SECONDS = 1.0
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
-TEND_SECONDS = 0.05
-"""How often links are looked after while their process is busy elsewhere."""
+CHANNEL = 4096
+"""Messages that may wait to be taken; then their links wait."""
 REFUSAL = zenoh.Encoding.TEXT_PLAIN
 """Of an error that was given as an answer; Zenoh's own, such as a time-out, have another."""
-
-
-_SENT = struct.Struct("<qQ8s")
-"""What accompanies a message: when it was sent, by which clock, and the sender's badge."""
+_SENT = struct.Struct("<qQ")
+"""What accompanies a message: when it was sent, and by which clock."""
 
 
 def _clock() -> int:
@@ -81,252 +71,142 @@ _CLOCK = _clock()
 class Bus:
     """One process' connection to the others of its run.
 
-    All callbacks run on one thread, in the order in which their causes arrived: Zenoh's own would run each
-    subscription on a thread of its own, and a step could overtake what it emitted.
+    Callbacks run on one thread, in the order in which their causes arrived: Zenoh's own would run each subscription on
+    a thread of its own, and a step could overtake what it emitted.
     """
 
     def __init__(
         self,
         run: str,
+        endpoint: str,
         *,
-        listen: str | None = None,
-        connect: str | None = None,
+        gateway: str = "",
         network: Network | None = None,
-        secret: str = "",
         process: Process | None = None,
-        guest: bool = False,
+        listen: bool = False,
     ):
-        """``connect`` is called first; without a ``network`` all of it stays on loopback.
+        """Calls at ``endpoint``, or with ``listen`` is the one who is called there, and at the run's ``gateway``.
 
-        ``process`` is who this is; None for who only listens.
-
-        What is published without the run's ``secret`` is refused by its processes. A ``guest`` speaks with the
-        process it connects to and with nobody else: were it to stand still, no other would wait for it.
-
-        Raises Refused where this machine cannot listen as it is told.
+        ``process`` is who this is. Raises Refused where this machine cannot listen as it is told.
         """
         self._run = run
-        self._secret = secret
-        self._session = open_session(listen, connect, network, mode="client" if guest else None)
-        self._declared: list[zenoh.Subscriber[None] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
-        self._far = network is not None
-        self._publishers: dict[str, zenoh.Publisher] = {}
-        self._offered: dict[str, _Offer] = {}
         self._process = process
-        self._host = network.host if network is not None else ""
-        self._present: dict[tuple[str, int], Process] = {}
-        """The newest process of each replica."""
-        self._links: dict[tuple[str, int], Link | None] = {}
-        """To those of them on this machine; None for the others."""
-        self._retired: list[Link] = []
-        """Of processes that are gone, as far as they may still read."""
-        self._linking = threading.Lock()
-        self._store = Store()
-        self._door: Door | None = None
+        self._gateway = gateway
+        self._far = network is not None
+        routed = network is not None and network.routed
+        own = endpoint if listen else new_endpoint(endpoint) if network is None else private(network.listen)
+        calls = [] if listen else [endpoint]
+        if gateway and network is None:
+            calls.append(gateway)
+        mode = "client" if routed else "peer"
+        self._open([] if routed else [own], calls, network, mode)
+
+    def _open(self, listen: list[str], connect: list[str], network: Network | None, mode: str) -> None:
+        self._session = open_session(listen, connect, network, mode=mode)
+        self._listener: zenoh.Session | None = None
+        self._declared: list[zenoh.Subscriber[Any] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
+        self._publishers: dict[str, zenoh.Publisher] = {}
         self._closed = threading.Event()
-        self._tender = threading.Thread(target=self._tend, name="links", daemon=True)
-        if process is not None:
-            self._tender.start()
         self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
         self._caller.start()
 
-    def publish(self, path: str, payload: bytes) -> None:
+    def publish(self, path: str, payload: bytes, *, may_be_dropped: bool = False) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run. Once closed it sends nothing."""
         if self._closed.is_set():
             return
         publisher = self._publishers.get(path)
         if publisher is None:
-            publisher = self._publishers[path] = self._declare(path, zenoh.CongestionControl.BLOCK)
-        publisher.put(payload, attachment=self._attachment(path))
+            control = zenoh.CongestionControl
+            publisher = self._publishers[path] = self._session.declare_publisher(
+                f"{self._run}/{path}",
+                congestion_control=control.DROP if may_be_dropped else control.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
 
-    def load(self, parts: Sequence[bytes | memoryview]) -> bytes | Block:
-        """The parts of a message as one payload: in memory that consumers can read where it is large."""
-        if sum(map(len, parts)) > INLINE_BYTES:
-            with contextlib.suppress(OSError):  # where there is none, Zenoh takes the message
-                return self._store.write(parts)
-        return b"".join(parts)
+    def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
+        """Calls back, in turn, for everything sent to ``path`` (``*`` and ``**`` allowed)."""
+        self.hand_over(path, lambda packet: self._calls.put(lambda: callback(packet)))
 
-    def deliver(self, to: tuple[str, int], path: str, payload: bytes | Block) -> bool:
-        """Sends to one process, (stage, replica), without loss, straight where it is on this machine.
+    def hand_over(self, path: str, take: Callable[[Packet], None]) -> None:
+        """Gives everything sent to ``path`` to ``take`` as it comes, on the link's own thread: it must not wait."""
+        self._declare(self._session, path, self._taker(take))
 
-        True where it is in that process' hands, or the kernel's, and arrives even if this process dies now.
-        """
-        link = self._links.get(to) or self._connect(to)
-        if link is not None and link.send(path, payload):
-            return True
-        self.publish(path, bytes(payload.view) if isinstance(payload, Block) else payload)
-        return False
+    def overhear(self, path: str, take: Callable[[Packet], None]) -> None:
+        """Does the same at the gateway, where there is one on this machine: what this process does not take in time is
+        dropped, and nobody waits."""
+        if self._listener is None and self._gateway and not self._far:
+            self._listener = open_session([], [self._gateway], None, mode="client")
+        self._declare(self._listener or self._session, path, self._taker(take))
 
-    def _connect(self, to: tuple[str, int]) -> Link | None:
-        """The link to a process that is present, made when it is first wanted; None where it is on another machine."""
-        with self._linking:
-            process = self._present.get(to)
-            if self._process is None or process is None or to in self._links:
-                return self._links.get(to)
-            link = None
-            with contextlib.suppress(OSError):
-                address = address_of(self._run, self._secret, self._host, process)
-                link = Link(address, self._secret, self._process.path, self._store)
-            self._links[to] = link
-            return link
-
-    def open_door(self, receive: Callable[[Packet], None], refuse: Callable[[str, Exception], None]) -> Door:
-        """Lets those on this machine deliver straight to this process, once it is announced.
-
-        ``receive`` gets what they send from whoever looks: see :class:`runner.transport.links.Door`.
-        """
-        assert self._process is not None
-        address = address_of(self._run, self._secret, self._host, self._process)
-        self._door = Door(address, self._secret, receive, refuse)
-        return self._door
-
-    def _tend(self) -> None:
-        while not self._closed.wait(TEND_SECONDS):
-            if self._door is not None:
-                self._door.tend()
-            with self._linking:
-                links = [*filter(None, self._links.values()), *self._retired]
-            for link in links:
-                if not link.collect() and link in self._retired:
-                    self._retired.remove(link)
-                    link.close()
-
-    def _note(self, process: Process, present: bool) -> None:
-        """Keeps to the newest process of a replica; the link to an older one lasts as long as that may read."""
-        place = process.stage, process.replica
-        with self._linking:
-            newest = self._present.get(place)
-            if present and (newest is None or process > newest):
-                self._present[place] = process
-            elif not present and process == newest:
-                del self._present[place]
-            else:
-                return
-            link = self._links.pop(place, None)
-        self._retired += [link] if link is not None else []
-
-    def offer(self, path: str, payload: bytes | memoryview) -> None:
-        """Sends to whoever listens, and to nobody who would have to be waited for."""
-        offered = self._offered.get(path)
-        if offered is None:
-            publisher = self._declare(path, zenoh.CongestionControl.DROP, zenoh.Priority.DATA_LOW)
-            offered = self._offered[path] = _Offer(publisher)
-        if offered.wanted:
-            offered.publisher.put(bytes(payload), attachment=self._attachment(path))
-
-    def _declare(
-        self, path: str, congestion: zenoh.CongestionControl, priority: zenoh.Priority = zenoh.Priority.DATA
-    ) -> zenoh.Publisher:
-        reliable = zenoh.Reliability.RELIABLE
-        return self._session.declare_publisher(
-            f"{self._run}/{path}", congestion_control=congestion, priority=priority, reliability=reliable
-        )
-
-    def _attachment(self, path: str) -> bytes:
-        return _SENT.pack(time.monotonic_ns(), _CLOCK, badge(self._secret, path))
-
-    def subscribe(
-        self, path: str, callback: Callable[[Packet], None], *, first: Callable[[Packet], None] | None = None
-    ) -> None:
-        """Calls back for everything sent to ``path`` (``*`` and ``**`` allowed).
-
-        ``first`` is called before, on the link's own thread: it may only hand the packet on.
-        """
-        skipped = len(self._run) + 1
-
+    def _taker(self, take: Callable[[Packet], None]) -> Callback[zenoh.Sample]:
         def receive(sample: zenoh.Sample) -> None:
-            arrived_ns = time.monotonic_ns()
-            key, (sent_ns, shown) = str(sample.key_expr)[skipped:], _attached(sample)
-            genuine = shown == badge(self._secret, key)
-            packet = Packet(key, sample.payload.to_bytes(), sent_ns, arrived_ns, genuine)
-            if first is not None:
-                first(packet)
-            self._calls.put(lambda: callback(packet))
+            take(self._packet(sample))
 
-        receiver = Callback(receive, indirect=False)
-        self._declared.append(self._session.declare_subscriber(f"{self._run}/{path}", receiver))
+        return Callback(receive, indirect=False)
+
+    def channel(self, path: str) -> Channel:
+        """Everything sent to ``path`` by others, to be taken when the time has come: cheaper than calls one by one."""
+        return Channel(self._declare(self._session, path, FifoChannel(CHANNEL)), self._packet)
+
+    def _declare(self, session: zenoh.Session, path: str, handler: Any) -> zenoh.Subscriber[Any]:
+        origin = zenoh.Locality.REMOTE  # who publishes knows it already
+        found: Any = session.declare_subscriber(f"{self._run}/{path}", handler, allowed_origin=origin)
+        self._declared.append(found)
+        return found
+
+    def _packet(self, sample: zenoh.Sample) -> Packet:
+        arrived_ns, key = time.monotonic_ns(), str(sample.key_expr)[len(self._run) + 1 :]
+        return Packet(key, sample.payload.to_bytes(), _sent_ns(sample), arrived_ns)
 
     def announce(self) -> None:
         """Declares this process present, until it closes or dies."""
         assert self._process is not None
-        self._declared.append(self._session.liveliness().declare_token(self._token(self._process)))
+        key = f"{self._run}/present/{self._process.path}"
+        self._declared.append(self._session.liveliness().declare_token(key))
 
     def watch(
         self, callback: Callable[[Process, bool], None], refuse: Callable[[str, Exception], None] = lambda *_: None
     ) -> None:
         """Calls back for every process that is or becomes present (True) and that goes (False).
 
-        ``refuse`` is told of keys that name none.
+        A process that goes need not be dead: its host may be cut off. ``refuse`` is told of keys that name none.
         """
 
-        def receive(sample: zenoh.Sample, _: int) -> None:
-            key = str(sample.key_expr)
+        def receive(sample: zenoh.Sample) -> None:
+            key, present = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             try:
-                process = Process.of(key.rpartition("/")[0])
-                if key != self._token(process):
-                    raise Refused("no process of this run")
+                process = Process.of(key)
             except Refused as refusal:
                 refuse(key.removeprefix(f"{self._run}/"), refusal)
-            else:
-                present = sample.kind == zenoh.SampleKind.PUT
-                if self._far and present:
-                    close_dead_links_at_once()
-                self._note(process, present)
-                callback(process, present)
+                return
+            if self._far and present:
+                close_dead_links_at_once()
+            callback(process, present)
 
         subscriber = self._session.liveliness().declare_subscriber(
             f"{self._run}/present/**", self._in_turn(receive), history=True
         )
         self._declared.append(subscriber)
 
-    def _token(self, process: Process) -> str:
-        path = f"present/{process.path}"
-        return f"{self._run}/{path}/{badge(self._secret, path).hex()}"
-
-    def answer_flush(self, afterwards: Callable[[Callable[[], None]], None]) -> None:
-        """Lets the others wait for the recorder: its answer follows everything they sent to it.
-
-        ``afterwards`` is given each answer, to be called once what has come straight is taken and echoed too.
-        """
-        key = f"{self._run}/flush"
-
-        def answer(query: zenoh.Query) -> None:
-            with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
-                query.reply(key, badge(self._secret, "flush"))
-
-        def receive(query: zenoh.Query, _: int) -> None:
-            afterwards(lambda: answer(query))
-
-        self._declared.append(self._session.declare_queryable(key, self._in_turn(receive)))
-
-    def flush(self) -> bool:
-        """Waits until the recorder has received everything sent before; False where it does not answer in time."""
-        replies = self._session.get(f"{self._run}/flush", timeout=FLUSH_SECONDS)
-        shown = badge(self._secret, "flush")
-        return any(reply.ok is not None and reply.ok.payload.to_bytes() == shown for reply in replies)
-
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
 
-        Who does not know the run's secret is refused. What ``answer`` raises becomes an error reply: the text of a
-        Refused, of anything else its type too.
+        What ``answer`` raises becomes an error reply: the text of a Refused, of anything else its type too.
         """
         key = f"{self._run}/q/{name}"
 
-        shown = badge(self._secret, f"q/{name}")
-
         def receive(query: zenoh.Query) -> None:
-            threading.Thread(target=_reply, args=(query, key, shown, answer), name=name, daemon=True).start()
+            threading.Thread(target=_reply, args=(query, key, answer), name=name, daemon=True).start()
 
         self._declared.append(self._session.declare_queryable(key, Callback(receive, indirect=False)))
 
     def ask(self, name: str, question: bytes, timeout_s: float) -> bytes:
         """The answer of whoever serves ``name``; raises Refused with its reason, or where nobody answers in time."""
-        deadline, shown = time.monotonic() + timeout_s, badge(self._secret, f"q/{name}")
+        deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
-            key = f"{self._run}/q/{name}"
-            for reply in self._session.get(key, payload=question, attachment=shown, timeout=left):
+            for reply in self._session.get(f"{self._run}/q/{name}", payload=question, timeout=left):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and reply.err.encoding == REFUSAL:
@@ -341,54 +221,48 @@ class Bus:
         self._closed.set()
         self._calls.put(None)
         if threading.current_thread() is not self._caller:
-            self._caller.join(FLUSH_SECONDS)
-        with contextlib.suppress(zenoh.ZError):  # who is cut off cannot say goodbye
-            self._session.close()
+            self._caller.join(CLOSE_SECONDS)
+        for session in filter(None, (self._listener, self._session)):
+            with contextlib.suppress(zenoh.ZError):  # who is cut off cannot say goodbye
+                session.close()
 
-        if self._process is not None:
-            self._tender.join()
-        if self._door is not None:
-            self._door.close()
-        for link in (*filter(None, self._links.values()), *self._retired):
-            link.close()
-
-    def _in_turn(self, receive: Callable[[A, int], None]) -> Callback[A]:
-        """A handler that only queues, so that it may run on the link's own thread; it gets the time of arrival."""
-
-        def enqueue(cause: A) -> None:
-            arrived_ns = time.monotonic_ns()
-            self._calls.put(lambda: receive(cause, arrived_ns))
-
-        return Callback(enqueue, indirect=False)
+    def _in_turn(self, receive: Callable[[A], None]) -> Callback[A]:
+        """A handler that only queues, so that it may run on the link's own thread."""
+        return Callback(lambda cause: self._calls.put(lambda: receive(cause)), indirect=False)
 
     def _call_all(self) -> None:
         """What a callback raises ends the process, with the traceback: it cannot go on half deaf."""
         try:
             while (call := self._calls.get()) is not None:
-                # What has come with it goes to a handler first: two threads at once would share the interpreter.
-                time.sleep(REST_SECONDS)
                 call()
-                for _ in range(self._calls.qsize()):
-                    if (call := self._calls.get()) is None:
-                        return
-                    call()
-        except Exception:
+        except BaseException:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(1)
 
 
-class _Offer:
-    """A publisher that knows whether anybody listens."""
+class Listener(Bus):
+    """A tool's connection to the gateway of a run: it hears and asks, and holds nobody up."""
 
-    def __init__(self, publisher: zenoh.Publisher):
-        self.publisher = publisher
-        self.wanted = False
-        cast("Any", publisher).declare_matching_listener(Callback(self._note, indirect=False))
-        self.wanted = self.wanted or cast("Any", publisher).matching_status.matching
+    def __init__(self, run: str, gateway: str):
+        """Raises Refused where nobody takes the call."""
+        self._run = run
+        self._process = None
+        self._far = False
+        self._open([], [gateway], None, "client")
 
-    def _note(self, status: Any) -> None:
-        self.wanted = status.matching
+
+class Channel:
+    """What has been sent to one process and waits to be taken."""
+
+    def __init__(self, subscriber: zenoh.Subscriber[Any], packet: Callable[[zenoh.Sample], Packet]):
+        self._subscriber = subscriber
+        self._packet = packet
+
+    def take(self) -> Iterator[Packet]:
+        """All that is there."""
+        while (sample := self._subscriber.try_recv()) is not None:
+            yield self._packet(sample)
 
 
 class Presence:
@@ -416,11 +290,45 @@ class Presence:
         return True
 
 
-def _reply(query: zenoh.Query, key: str, shown: bytes, answer: Callable[[bytes], bytes]) -> None:
+END_SECONDS = 8.0
+"""How long a process that ends waits at most for the others to publish no more."""
+
+
+class Peers:
+    """Which processes of a run publish no more: they have ended, or are dead."""
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[str, int], int] = {}
+        self._ended: dict[tuple[str, int], int] = {}
+        """Incarnation by (stage, replica)."""
+        self._changed = threading.Condition()
+
+    def appeared(self, process: Process) -> None:
+        """Takes note of a process that is there."""
+        with self._changed:
+            place = process.stage, process.replica
+            self._newest[place] = max(process.incarnation, self._newest.get(place, 0))
+
+    def ended(self, process: Process) -> None:
+        """Takes note of one that has ended."""
+        with self._changed:
+            place = process.stage, process.replica
+            self._ended[place] = max(process.incarnation, self._ended.get(place, 0))
+            self._changed.notify_all()
+
+    def wait_for(self, stages: Collection[str], processes: Iterable[tuple[str, int]]) -> None:
+        """Waits until nothing more comes from these stages, whose ``processes`` are (stage, replica)."""
+        wanted = {place for place in (*processes, (SUPERVISOR, 0)) if place[0] in stages}
+        with self._changed:
+            self._changed.wait_for(lambda: all(map(self._has_ended, wanted)), END_SECONDS)
+
+    def _has_ended(self, place: tuple[str, int]) -> bool:
+        return self._ended.get(place, -1) >= self._newest.get(place, 0)
+
+
+def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:
     with query, contextlib.suppress(zenoh.ZError):  # the bus closes while somebody waits
         try:
-            if query.attachment is None or query.attachment.to_bytes() != shown:
-                raise Refused("only who knows the secret of this run may ask")
             query.reply(key, answer(query.payload.to_bytes() if query.payload else b""))
         except Refused as refusal:
             query.reply_err(str(refusal), encoding=REFUSAL)
@@ -428,10 +336,10 @@ def _reply(query: zenoh.Query, key: str, shown: bytes, answer: Callable[[bytes],
             query.reply_err(f"{type(error).__name__}: {error}", encoding=REFUSAL)
 
 
-def _attached(sample: zenoh.Sample) -> tuple[int, bytes]:
-    """When it was sent, 0 where that is not known, and the sender's badge."""
+def _sent_ns(sample: zenoh.Sample) -> int:
+    """When it was sent, 0 where that is not known."""
     data = sample.attachment.to_bytes() if sample.attachment is not None else b""
     if len(data) != _SENT.size:
-        return 0, b""
-    sent_ns, clock, badge = _SENT.unpack(data)
-    return (sent_ns if clock == _CLOCK else 0), badge
+        return 0
+    sent_ns, clock = _SENT.unpack(data)
+    return sent_ns if clock == _CLOCK else 0

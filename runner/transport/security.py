@@ -7,13 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runner.graph.placement import ROUTER, Credentials, Layout, Network
+from runner.graph.placement import READER, ROUTER, Credentials, Layout, Network
 
-EVERYTHING = (
-    *("put", "delete", "declare_subscriber"),
-    *("query", "reply", "declare_queryable"),
-    *("liveliness_token", "declare_liveliness_subscriber", "liveliness_query"),
-)
+SPEAKING = ("put", "delete", "declare_queryable", "liveliness_token")
+EVERYTHING = (*SPEAKING, "declare_subscriber", "query", "reply", "declare_liveliness_subscriber", "liveliness_query")
 ORDERS = "hosts/*/order/**"
 """Keys on which the head has processes started."""
 
@@ -30,19 +27,54 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
         _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
         _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
     ]
-    subjects = {"hosts": list(network.hosts), **({"others": others} if others else {})}
-    policies = {"hosts": "take part", "others": "give orders"}
+    subjects: dict[str, list[str]] = {"hosts": list(network.hosts), **({"others": others} if others else {})}
+    policies = {"hosts": "take part", **({"others": "give orders"} if others else {})}
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": _tls(credentials),
-        "access_control": {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": rules,
-            "subjects": [{"id": name, "cert_common_names": names} for name, names in subjects.items()],
-            "policies": [{"rules": [policies[name]], "subjects": [name]} for name in subjects],
-        },
+        **_access(
+            "deny", rules, [{"id": name, "cert_common_names": names} for name, names in subjects.items()], policies
+        ),
     }
+
+
+def readers_only(network: Network | None, public: str | None) -> dict[str, Any]:
+    """Settings of a gateway, beside those of its network: who comes in at ``public`` hears everything and says nothing.
+
+    With keys that is whoever shows the certificate :data:`READER`; tools come in at a socket of this user.
+    """
+    if network is None or network.credentials is None:
+        if public is None:
+            return {}
+        rule = _rule("say nothing", "deny", (*SPEAKING, "query"), ("ingress",), "**")
+        return _access("allow", [rule], [{"id": "strangers", "link_protocols": ["tcp"]}], {"strangers": "say nothing"})
+    settings = security(network, network.credentials)
+    access = settings["access_control"]
+    rules = [
+        *access["rules"],
+        _rule("listen", "allow", ("declare_subscriber",), ("ingress", "egress"), "**"),
+        _rule("be told", "allow", ("put", "delete"), ("egress",), "**"),
+    ]
+    subjects = [
+        *access["subjects"],
+        {"id": "tools", "link_protocols": ["unixsock-stream"]},
+        {"id": "readers", "cert_common_names": [READER]},
+    ]
+    policies = [
+        *access["policies"],
+        {"rules": ["take part"], "subjects": ["tools"]},
+        {"rules": ["listen", "be told"], "subjects": ["readers"]},
+    ]
+    return {
+        "transport/link/protocols": ["tls", "unixsock-stream"],
+        "access_control": {**access, "rules": rules, "subjects": subjects, "policies": policies},
+    }
+
+
+def _access(default: str, rules: list[Any], subjects: list[Any], policies: dict[str, str]) -> dict[str, Any]:
+    listed = [{"rules": [rule], "subjects": [subject]} for subject, rule in policies.items()]
+    access = {"rules": rules, "subjects": subjects, "policies": listed}
+    return {"access_control": {"enabled": True, "default_permission": default, **access}}
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:

@@ -1,36 +1,89 @@
-"""Zenoh sessions as every process opens them: all that Zenoh is ever told."""
+"""Zenoh sessions as every process opens them: all that Zenoh is ever told.
+
+The processes of one machine meet at Unix sockets in a folder that only their user may enter; between machines they meet
+over mutual TLS. Whoever else listens, a tool or a stranger, does so at the run's :class:`Gateway`.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
+import secrets
+import shutil
 import socket
 import stat
 import struct
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from runner.contract import Refused
 from runner.graph.placement import Network
-from runner.transport.security import security
+from runner.transport.security import readers_only, security
 
 LEASE_MS = 5000
 """A host of which nothing is heard for so long is cut off."""
+PATIENT_LEASE_MS = 7 * 24 * 3600 * 1000
+"""On one machine: a socket tells at once when a process has died, and one that is stopped for a while has not."""
 BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
-GUEST_MS = 10_000
-"""How long a guest calls a process that does not take the call."""
+CALL_MS = 10_000
+"""How long a tool calls a run that does not take the call."""
+GATEWAY_BATCHES = 16
+"""Of 64 KiB that may wait for a listener; the most that Zenoh allows."""
+_UNIX = "unixsock-stream"
 
 
-def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
-    """An endpoint that nothing listens on, on loopback or with the protocol and address of another one."""
-    address = like.partition("/")[2].rpartition(":")[0]
-    family, *_, bare = socket.getaddrinfo(address.strip("[]"), 0, type=socket.SOCK_STREAM)[0]
-    with socket.socket(family) as probe:
-        probe.bind(bare)
-        return f"{like.rpartition(':')[0]}:{probe.getsockname()[1]}"
+def runtime_folder() -> Path:
+    """Where this user's runs are listed and have their sockets; raises Refused where others could write to it."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    usable = bool(runtime) and os.access(runtime, os.W_OK | os.X_OK)  # another user's after `su`, or gone
+    folder = Path(runtime) / "runner" if usable else Path(f"/tmp/runner-{os.getuid()}")
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise Refused(f"{folder}: runs cannot be listed there: {error.strerror}") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise Refused(f"{folder}: must be a folder that only this user may enter; type: rm -rf {folder}")
+    return folder
+
+
+def new_endpoint(like: str = "") -> str:
+    """An endpoint where nobody listens yet: a socket beside that of ``like``, or in a new folder of its own.
+
+    Where ``like`` is an address, a free port of it.
+    """
+    protocol, _, address = like.partition("/")
+    if protocol == "tls":
+        family, *_, bare = socket.getaddrinfo(address.rpartition(":")[0].strip("[]"), 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family) as probe:
+            probe.bind(bare)
+            return f"{like.rpartition(':')[0]}:{probe.getsockname()[1]}"
+    folder = Path(address).parent if protocol == _UNIX else runtime_folder() / secrets.token_hex(4)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return f"{_UNIX}/{folder}/{secrets.token_hex(4)}"
+
+
+def remove_sockets(endpoint: str) -> None:
+    """Removes the folder of an endpoint's sockets; nothing where it is an address."""
+    protocol, _, path = endpoint.partition("/")
+    if protocol == _UNIX:
+        shutil.rmtree(Path(path).parent, ignore_errors=True)
+
+
+def private(endpoint: str) -> str:
+    """A loopback address without TLS stands for a socket of this user: another user cannot reach it."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol != "tcp":
+        return endpoint
+    folder = runtime_folder() / f"at-{hashlib.sha256(address.encode()).hexdigest()[:8]}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return f"{_UNIX}/{folder}/{'meet' if not address.endswith(':0') else secrets.token_hex(4)}"
 
 
 def close_dead_links_at_once() -> None:
@@ -53,48 +106,85 @@ class Router:
 
     def __init__(self, endpoint: str, network: Network):
         """Raises Refused where this machine cannot listen there."""
-        self._session = open_session(endpoint, None, network, mode="router")
+        self._session = open_session([endpoint], [], network, mode="router")
 
     def close(self) -> None:
         """Lets everybody go."""
         self._session.close()
 
 
+class Gateway:
+    """Where tools and strangers listen to a run, as clients.
+
+    What one of them does not take in time is dropped: whoever stands still here costs the graph nothing. Nobody
+    publishes through it, and strangers ask nothing either.
+    """
+
+    def __init__(self, endpoint: str, meeting: str, network: Network | None, public: str | None):
+        """Opens at ``endpoint``, a socket of this user, and at ``public``, for everybody who reaches that."""
+        mesh = [] if network is None or network.routed else [private(network.listen)]
+        listen = [endpoint, *mesh, *([public] if public else [])]
+        mode = "router" if network is not None and network.routed else "peer"
+        dropped = {"id": "listeners", "messages": ["put"], "flows": ["egress"], "key_exprs": ["**"]}
+        queue = {"data": GATEWAY_BATCHES, "data_low": GATEWAY_BATCHES}
+        settings: dict[str, Any] = {
+            # The others call here: they need not be told where this is, nor listeners where they are.
+            "scouting/gossip/enabled": network is not None,
+            "qos/network": [{**dropped, "overwrite": {"congestion_control": "drop"}}],
+            "transport/link/tx/queue/size": queue,
+        }
+        settings |= readers_only(network, public)
+        self._session = open_session(listen, [meeting], network, mode=mode, settings=settings)
+
+    def announce(self, key: str) -> None:
+        """Declares the gateway present: whoever sees that is heard by its listeners."""
+        self._token = self._session.liveliness().declare_token(key)
+
+    def close(self) -> None:
+        """Lets all listeners go."""
+        self._session.close()
+
+
 def open_session(
-    listen: str | None, connect: str | None, network: Network | None, mode: str | None = None
+    listen: Sequence[str],
+    connect: Sequence[str],
+    network: Network | None = None,
+    *,
+    mode: str = "peer",
+    settings: dict[str, Any] | None = None,
 ) -> zenoh.Session:
-    """Opens a session; raises Refused where this machine cannot listen as it is told."""
-    config = _config(listen, connect, network, mode)
+    """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes a client."""
+    config = _config(list(listen), list(connect), network, mode, settings or {})
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        where = json.loads(config.get_json("listen/endpoints")) or json.loads(config.get_json("connect/endpoints"))
+        where = ", ".join((*listen, *connect))
         reason = str(error).partition(" at /")[0]
-        raise Refused(f"{', '.join(where)}: cannot be used: {reason}; is another graph running there?") from None
+        raise Refused(f"{where}: cannot be used: {reason}; is another graph running there?") from None
 
 
-def _config(listen: str | None, connect: str | None, network: Network | None, mode: str | None) -> zenoh.Config:
-    routed = network is not None and network.routed
-    own = network.listen if network else "tcp/127.0.0.1:0"
-    mode = mode or ("client" if routed else "peer")
+def _config(
+    listen: list[str], connect: list[str], network: Network | None, mode: str, more: dict[str, Any]
+) -> zenoh.Config:
+    calls_once = mode == "client" and not (network is not None and network.routed)
     settings: dict[str, Any] = {
         "mode": mode,
-        "listen/endpoints": [] if mode == "client" else [listen or own],
-        "connect/endpoints": [connect] if connect else [],
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
         # A router may be started after those that call it.
-        "connect/timeout_ms": GUEST_MS if mode == "client" and not routed else -1,
-        "connect/exit_on_failure": mode == "client" and not routed,
+        "connect/timeout_ms": CALL_MS if calls_once else -1,
+        "connect/exit_on_failure": calls_once,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
-        # Of 200 messages in shared memory one or two were lost, without a word, in every second run on a busy machine.
+        # Every reader would have to lock the publisher's pool in memory, and without a word gets nothing where it may
+        # not; what a process reads that stands still is overwritten. See docs/performance.md.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
+        "transport/link/tx/lease": PATIENT_LEASE_MS if network is None or network.credentials is None else LEASE_MS,
     }
-    if network is not None:
-        settings["transport/link/tx/lease"] = LEASE_MS
     if network is not None and network.credentials is not None:
         settings |= security(network, network.credentials)
     config = zenoh.Config()
-    for key, value in settings.items():
+    for key, value in {**settings, **more}.items():
         config.insert_json5(key, json.dumps(value))
     return config

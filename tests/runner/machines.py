@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.transport.session import free_endpoint
+from runner.transport.session import new_endpoint
 from tests.runner.test_runs import Run
 
 HOSTS = Path(__file__).with_name("hosts.yaml")
@@ -48,8 +48,13 @@ class Machines:
         _ip("-n", self.spaces["head"], "link", "set", f"to-{host}", "up")
 
 
+def free_address() -> str:
+    """ADDRESS:PORT on loopback where nobody listens."""
+    return new_endpoint("tls/127.0.0.1:0").partition("/")[2]
+
+
 def on_loopback() -> Machines:
-    return Machines({"head": free_endpoint().partition("/")[2]})
+    return Machines({"head": free_address()})
 
 
 @contextlib.contextmanager

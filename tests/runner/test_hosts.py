@@ -12,8 +12,7 @@ from runner.cli.main import main
 from runner.graph.placement import Host
 from runner.hosts.keys import make_keys
 from runner.recording.recording import Recording
-from runner.transport.session import free_endpoint
-from tests.runner.machines import HOSTS, NAMES, Machines, Party, in_namespaces, on_loopback, run_here
+from tests.runner.machines import HOSTS, NAMES, Machines, Party, free_address, in_namespaces, on_loopback, run_here
 from tests.runner.test_runs import Run, processes_of, read_until
 from tests.runner.waiting import wait_until
 
@@ -193,7 +192,7 @@ def test_a_stateful_stage_gets_its_state_back_on_its_host(parties, tmp_path: Pat
 
 @pytest.mark.slow
 def test_hosts_meet_at_a_router_that_is_none_of_them(here: Run, parties, tmp_path: Path):
-    graph, endpoint = tmp_path / "graph.yaml", free_endpoint().partition("/")[2]
+    graph, endpoint = tmp_path / "graph.yaml", free_address()
     graph.write_text(f"router: {endpoint}\n{HOSTS.read_text()}")
     assert main(["keys", "init", str(graph)]) == 0
     router = zenoh.open(zenoh.Config.from_file(str(tmp_path / "keys" / "router" / "zenohd.json5")))

@@ -1,26 +1,24 @@
 """Hosts in graph files: what is read from them, what is refused as unsafe, and what never crosses."""
 
+import re
 import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
-import msgspec
 import pytest
 import zenoh
 
 from runner.contract import Refused
 from runner.graph.document import Document, read_document
-from runner.graph.graph import Graph, Route, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
+from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
 from runner.graph.placement import Host, Layout, read_layout, read_owners
 from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, differences, moved
-from runner.message.codec import Envelope
 from runner.message.packet import Process
-from runner.process.delivery import Delivery, Payload
 from runner.transport import bus
 from runner.transport.bus import Bus, Presence
-from runner.transport.session import free_endpoint
-from tests.runner.machines import HOSTS
+from runner.transport.session import new_endpoint
+from tests.runner.machines import HOSTS, free_address
 from tests.runner.test_runs import DOUBLES, finish, read_until, start
 
 OUT = "sink.path=out.txt"
@@ -178,8 +176,8 @@ def test_two_graphs_on_one_machine_never_meet():
     heard: dict[str, list[bytes]] = {"one": [], "two": []}
     buses: list[Bus] = []
     for name, packets in heard.items():
-        endpoint = free_endpoint()
-        listener, speaker = Bus("same", listen=endpoint), Bus("same", connect=endpoint)
+        endpoint = new_endpoint()
+        listener, speaker = Bus("same", endpoint, listen=True), Bus("same", endpoint)
         listener.subscribe("**", lambda packet, packets=packets: packets.append(packet.payload))
         buses += [speaker, listener]
         deadline = time.monotonic() + 30
@@ -196,35 +194,11 @@ def test_two_graphs_on_one_machine_never_meet():
 
 def test_times_of_another_clock_are_not_taken():
     for clock, sent_ns in ((bus._CLOCK, 5), (bus._CLOCK ^ 1, 0)):
-        sample = SimpleNamespace(attachment=zenoh.ZBytes(bus._SENT.pack(5, clock, b"12345678")))
-        assert bus._attached(cast("zenoh.Sample", sample)) == (sent_ns, b"12345678")
+        sample = SimpleNamespace(attachment=zenoh.ZBytes(bus._SENT.pack(5, clock)))
+        assert bus._sent_ns(cast("zenoh.Sample", sample)) == sent_ns
 
 
 # ---------------------------------------------------------------------------------------------- who is cut off
-
-
-def envelope(number: int) -> Envelope:
-    return Envelope(f"a.piece#{number}", f"a.piece#{number}", 0, "Piece", 1, (), msgspec.Raw(b"\xc0"))
-
-
-def test_an_old_process_that_is_seen_again_takes_nothing_from_its_successor():
-    sent: list[str] = []
-
-    def send(_: tuple[str, int], key: str, __: Payload) -> bool:
-        sent.append(key)
-        return False
-
-    route = Route("piece", "worker", "piece", "block", 8, shared=True, kept=False)
-    delivery = Delivery([route], send, print, lambda: False)
-    old, new = Process("worker", 0, 0), Process("worker", 0, 1)
-    delivery.update(old, True)
-    delivery.publish("piece", envelope(0), b"")
-    delivery.update(new, True)
-    assert sent == ["d/worker/0/piece"] * 2  # the old one was cut off with it
-    for present in (False, True, False):
-        delivery.update(old, present)
-    delivery.publish("piece", envelope(1), b"")
-    assert sent == ["d/worker/0/piece"] * 3
 
 
 def test_a_replica_is_there_while_one_of_its_processes_is():
@@ -236,7 +210,7 @@ def test_a_replica_is_there_while_one_of_its_processes_is():
 
 
 def test_a_host_that_stays_away_ends_what_runs_nowhere_else(tmp_path: Path):
-    graph = load(tmp_path, f"hosts.head={free_endpoint().partition('/')[2]}")
+    graph = load(tmp_path, f"hosts.head={free_address()}")
     said: list[str] = []
     hosts = Hosts("hosts", tmp_path / "graph.yaml", graph.layout, lambda text, _: said.append(text))
     there = Hello("worker2", 1, "", "", "", "", "")
@@ -250,14 +224,31 @@ def test_a_host_that_stays_away_ends_what_runs_nowhere_else(tmp_path: Path):
     hosts.close(0, "")
 
 
-def test_without_keys_nothing_listens_beyond_loopback(tmp_path: Path):
-    process = start(DOUBLES, tmp_path, "counter.count=100000", "counter.period=0.005", "sink.count=100000")
+@pytest.mark.parametrize("port", [None, "47447"])
+def test_nothing_listens_where_others_could_call_unless_the_graph_says_so(tmp_path: Path, port: str | None):
+    settings = ("counter.count=100000", "counter.period=0.005", "sink.count=100000")
+    opened = (f"listen=tcp/127.0.0.1:{port}",) if port else ()
+    process = start(DOUBLES, tmp_path, *settings, *opened)
     before = read_until(process, "processes are ready")
     addresses = {address for pid in descendants(process.pid) for address in listening(pid)}
     process.terminate()
     finish(process, tmp_path, before)
-    assert len(addresses) >= 5
-    assert {address.partition(":")[0] for address in addresses} == {LOOPBACK_HEX}
+    assert addresses == ({f"{LOOPBACK_HEX}:{int(port):04X}"} if port else set())
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ("tcp/0.0.0.0:7447", "nobody can call 0.0.0.0"),
+        ("tcp/192.168.0.3:7447", "not loopback, and without keys anybody who reaches it could listen"),
+        ("tls/127.0.0.1:7447", "TLS needs hosts and keys; valid: tcp/127.0.0.1:7447"),
+        ("tcp/127.0.0.1", "the port is missing; valid: tcp/127.0.0.1:7447"),
+        ("127.0.0.1:7447", "valid: tcp/127.0.0.1:7447, or with keys tls/ADDRESS:PORT"),
+    ],
+)
+def test_where_others_listen_is_checked(value: str, reason: str):
+    with pytest.raises(Refused, match=re.escape(reason)):
+        load_graph(DOUBLES, ("sink.path=x", f"listen={value}"))
 
 
 def descendants(pid: int) -> list[int]:

@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 from runner.cli.main import main
 from runner.contract import Refused
 from runner.message.codec import Step, envelope, pack
-from runner.message.packet import RECORDER
 from runner.recording.recording import Recording
 from runner.recording.recover import recover
 from runner.supervise.supervisor import EXIT_INCOMPLETE
@@ -125,8 +124,8 @@ def publish_until_killed(session: Session, kill: Callable[[], None], seconds: fl
         own, now = f"camera.picture#{number}", time.time_ns()
         sealed = envelope(Number(value=0), id=own, lineage=own, time_ns=now, causes=())
         step = Step("camera", 0, 0, number, "source", (), (own,), now, 0, 0, 0)
-        session.bus.deliver((RECORDER, 0), "m/camera/picture", pack(sealed))
-        session.bus.deliver((RECORDER, 0), "s/camera", pack(step))
+        session.bus.publish("m/camera/picture", pack(sealed))
+        session.bus.publish("s/camera", pack(step))
         number += 1
         time.sleep(0.002)
     killed = time.time_ns()

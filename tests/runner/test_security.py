@@ -11,15 +11,15 @@ import zenoh
 
 from runner.graph.placement import Credentials, Host, Network
 from runner.hosts.keys import add_keys, credentials, make_keys
-from runner.message.packet import Process, badge
+from runner.message.packet import Process
 from runner.transport.bus import Bus
-from runner.transport.session import Router, free_endpoint
+from runner.transport.session import Router, new_endpoint
 from tests.runner.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")
-PIECE = "d/worker/0/piece"
+PIECE = "again/worker/0/piece"
 NUMBER = "m/counter/number"
-STRANGER = "present/stranger/0/0/badge"
+STRANGER = "present/stranger/0/0"
 
 
 @pytest.fixture(scope="module")
@@ -53,17 +53,16 @@ class Table:
 
 @pytest.fixture(params=["direct", "routed"])
 def table(keys: Path, request: pytest.FixtureRequest) -> Iterator[Table]:
-    endpoint = f"tls/{free_endpoint().partition('/')[2]}"
+    endpoint = new_endpoint("tls/127.0.0.1:0")
     routed = request.param == "routed"
     own, other = (
         Network(name, "head", NAMES, "tls/127.0.0.1:0", routed, credentials(keys, name)) for name in NAMES[:2]
     )
     router = [Router(endpoint, own)] if routed else []
-    meeting = {"connect": endpoint} if routed else {"listen": endpoint}
-    head = Bus("run", **meeting, network=own, process=Process("counter", 0))
-    made = Table(endpoint, head, Bus("run", connect=endpoint, network=other))
+    head = Bus("run", endpoint, network=own, process=Process("counter", 0), listen=not routed)
+    made = Table(endpoint, head, Bus("run", endpoint, network=other))
     made.worker.subscribe("**", lambda packet: made.arrived.append((packet.key, packet.payload)))
-    made.worker.watch(lambda *_: None, lambda key, _: made.present.append(key))
+    made.worker.watch(lambda process, _: made.present.append(f"present/{process.path}"))
     head.serve("status", lambda question: made.asked.append(question) or b"up")
     assert made.worker.ask("status", b"worker1", 10) == b"up"
     yield made
@@ -106,12 +105,11 @@ def try_everything(table: Table, session: zenoh.Session, seconds: float) -> Peer
         session.liveliness().declare_token(f"run/{STRANGER}"),
     ]
     table.head.announce()
-    shown = badge("", "q/status")  # as one who knows the run's secret
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and not succeeded(table, peer):
         table.head.publish(NUMBER, b"number")
         session.put(f"run/{PIECE}", b"piece")
-        replies = session.get("run/q/status", payload=b"stranger", attachment=shown, timeout=0.5)
+        replies = session.get("run/q/status", payload=b"stranger", timeout=0.5)
         peer.answers += [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         time.sleep(0.1)
     for declared in keep:
@@ -156,11 +154,10 @@ def test_whoever_speaks_no_tls_is_not_let_in(table: Table, keys: Path):
 
 
 def test_only_the_head_gives_orders(keys: Path):
-    endpoint = f"tls/{free_endpoint().partition('/')[2]}"
+    endpoint = new_endpoint("tls/127.0.0.1:0")
     networks = [Network(name, "head", NAMES, "tls/127.0.0.1:0", False, credentials(keys, name)) for name in NAMES]
-    head = Bus("hosts/toys", listen=endpoint, network=networks[0])
-    worker = Bus("hosts/toys", connect=endpoint, network=networks[1])
-    other = Bus("hosts/toys", connect=endpoint, network=networks[2])
+    head = Bus("hosts/toys", endpoint, network=networks[0], listen=True)
+    worker, other = (Bus("hosts/toys", endpoint, network=network) for network in networks[1:])
     orders: list[bytes] = []
     reports: list[bytes] = []
     worker.subscribe("order/worker1/1", lambda packet: orders.append(packet.payload))

@@ -1,0 +1,125 @@
+"""What the recorder has and consumers have not done with: sent again to who may have missed it.
+
+A process that is killed takes with it the last messages that it has sent to some consumers, and not to others; one that
+takes the place of another has heard nothing yet. The recorder judges both: what it has was sent, and what no step has
+consumed is still to be done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from runner.graph.graph import Destination, Route
+from runner.message.codec import Step, answered
+from runner.message.packet import Process
+
+LATEST_SECONDS = 0.5
+"""After that the newest message of an edge of policy ``latest`` is offered again, then after twice the time, ..."""
+
+REMEMBERED = 10_000
+"""Ids of messages that are recognised when they come once more."""
+
+Send = Callable[[str, bytes, bool], None]
+"""Sends a payload under a key; the last argument says whether it may be dropped where nobody takes it."""
+
+
+class _Waiting:
+    """What one consumer, all of its replicas or one of them, has not done with on one port."""
+
+    def __init__(self, route: Route) -> None:
+        self.route = route
+        self.messages: OrderedDict[str, bytes] = OrderedDict()
+        self.kept: deque[tuple[str, bytes]] = deque(maxlen=route.kept)
+        """The newest of what has been used and may be used again."""
+        self.offer_at = 0.0
+        self.pause = LATEST_SECONDS
+
+    def add(self, id: str, payload: bytes) -> None:
+        if self.route.policy == "latest":
+            self.messages.clear()
+            self.pause = LATEST_SECONDS
+            self.offer_at = time.monotonic() + self.pause
+        self.messages[id] = payload
+
+    def done(self, id: str) -> bool:
+        payload = self.messages.pop(id, None)
+        if payload is not None and self.route.kept:
+            self.kept.append((id, payload))
+        return payload is not None
+
+
+class Redelivery:
+    """All edges of a run. Not to be called from several threads at once."""
+
+    def __init__(self, topics: Mapping[str, tuple[Destination, ...]], send: Send) -> None:
+        """``topics`` are the edges by the ``STAGE/PORT`` that they come from."""
+        self._send = send
+        self._edges = {topic: dict(_edges(destinations)) for topic, destinations in topics.items()}
+        self._by_place = {place: waiting for edges in self._edges.values() for place, waiting in edges.items()}
+        self._recent: OrderedDict[str, None] = OrderedDict()
+        """Ids of messages that have come lately."""
+        self._early: set[tuple[str, int, str, str]] = set()
+        """(stage, taker, port, id) done with before it came: its publisher's link is the slower one."""
+
+    def note_message(self, topic: str, id: str, payload: bytes) -> Iterator[tuple[str, str]]:
+        """Takes a message that has come; yields (stage, port) of consumers that had done with it already.
+
+        Its publisher has died meanwhile and its successor, which has sent it once more, does not know that.
+        """
+        known = id in self._recent
+        self._recent[id] = None
+        if len(self._recent) > REMEMBERED:
+            self._recent.popitem(last=False)
+        for place, waiting in self._edges.get(topic, {}).items():
+            early = (*place, id) in self._early
+            self._early.discard((*place, id))
+            if early or (known and id not in waiting.messages):
+                yield place[0], place[2]
+            elif not known:
+                waiting.add(id, payload)
+
+    def note_step(self, step: Step) -> None:
+        """Takes a step."""
+        for port, id in answered(step):
+            for taker in (step.replica, -1):
+                waiting = self._by_place.get((step.stage, taker, port))
+                if waiting is not None and not waiting.done(id) and id not in self._recent:
+                    self._early.add((step.stage, taker, port, id))
+
+    def appeared(self, process: Process) -> None:
+        """Sends a new process all that it has to do, oldest first."""
+        for (stage, taker, _), waiting in self._by_place.items():
+            if stage == process.stage and taker in (process.replica, -1):
+                self._again(process.replica, waiting, (*waiting.kept, *waiting.messages.items()))
+
+    def lost(self, process: Process, living: Iterable[Process]) -> None:
+        """Sends what a dead process has published, and nobody has done with, to those who may not have got it."""
+        replicas = list(living)
+        for topic, edges in self._edges.items():
+            if topic.partition("/")[0] == process.stage:
+                for (stage, taker, _), waiting in edges.items():
+                    for one in replicas:
+                        if one.stage == stage and taker in (one.replica, -1):
+                            self._again(one.replica, waiting, waiting.messages.items())
+
+    def offer_latest(self) -> None:
+        """Sends the newest of each edge of policy ``latest`` again that has not been used for a while."""
+        now = time.monotonic()
+        for (_, taker, _), waiting in self._by_place.items():
+            if waiting.route.policy == "latest" and waiting.messages and now > waiting.offer_at:
+                waiting.pause *= 2
+                waiting.offer_at = now + waiting.pause
+                self._again(taker, waiting, waiting.messages.items())
+
+    def _again(self, replica: int, waiting: _Waiting, messages: Iterable[tuple[str, bytes]]) -> None:
+        route = waiting.route
+        for _, payload in messages:
+            self._send(f"again/{route.consumer}/{replica}/{route.input}", payload, route.policy == "latest")
+
+
+def _edges(destinations: Iterable[Destination]) -> Iterator[tuple[tuple[str, int, str], _Waiting]]:
+    for one in destinations:
+        for taker in one.takers:
+            yield (one.route.consumer, taker, one.route.input), _Waiting(one.route)

@@ -1,0 +1,124 @@
+"""Whatever a dead process took with it, and a new one has not heard, is sent again by the recorder; nothing twice."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from runner.graph.graph import Destination, Route
+from runner.message.codec import Outcome, Step
+from runner.message.packet import Process
+from runner.process import redelivery
+from runner.process.redelivery import Redelivery
+
+TOPIC = "counter/number"
+ROUTE = Route("number", "worker", "input", "block", queue=4, shared=False, kept=0)
+
+
+class Recorder:
+    """A redelivery and what it has sent, as (key, payload)."""
+
+    def __init__(self, replicas: int = 1, **changes: Any) -> None:
+        self.sent: list[tuple[str, bytes]] = []
+        destination = Destination(msgspec.structs.replace(ROUTE, **changes), replicas)
+        self.redelivery = Redelivery({TOPIC: (destination,)}, lambda key, payload, _: self.sent.append((key, payload)))
+
+    def message(self, number: int) -> tuple[str, list[tuple[str, str]]]:
+        id = f"counter.number#{number}"
+        return id, list(self.redelivery.note_message(TOPIC, id, id.encode()))
+
+    def step(self, *consumed: str, replica: int = 0, outcome: Outcome = "done", left: tuple[str, ...] = ()) -> None:
+        pairs, others = tuple(("input", id) for id in consumed), tuple(("input", id) for id in left)
+        self.redelivery.note_step(
+            Step("worker", replica, 0, 0, "on", pairs, (), 0, 0, 0, 0, outcome=outcome, left=others)
+        )
+
+    def take(self) -> list[tuple[str, str]]:
+        """(replica, id) of what was sent again."""
+        sent, self.sent = self.sent, []
+        return [(key.split("/")[2], payload.decode()) for key, payload in sent]
+
+
+def test_a_new_process_gets_what_nobody_has_done_with():
+    recorder = Recorder()
+    first, second, third = (recorder.message(number)[0] for number in range(3))
+    recorder.step(second)
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == [("0", first), ("0", third)]
+
+
+def test_what_a_dead_publisher_has_sent_is_sent_to_who_may_lack_it():
+    recorder = Recorder(replicas=2)
+    first, second = (recorder.message(number)[0] for number in range(2))
+    recorder.step(first, replica=1)
+    recorder.redelivery.lost(Process("counter", 0), [Process("worker", 0), Process("worker", 1), Process("sink", 0)])
+    assert sorted(recorder.take()) == [("0", first), ("0", second), ("1", second)]
+
+
+def test_parts_are_done_with_by_any_replica():
+    recorder = Recorder(replicas=2, shared=True)
+    first, second = (recorder.message(number)[0] for number in range(2))
+    recorder.step(first, replica=1)
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == [("0", second)]
+
+
+def test_what_joins_keep_is_sent_again_though_it_was_used():
+    recorder = Recorder(kept=1)
+    first, second = (recorder.message(number)[0] for number in range(2))
+    recorder.step(first)
+    recorder.step(second)
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == [("0", second)]
+
+
+@pytest.mark.parametrize(("outcome", "again"), [("failed", True), ("ended", True), ("done", False)])
+def test_what_was_refused_is_done_with_and_what_a_failed_step_or_an_end_leaves_is_not(outcome: Outcome, again: bool):
+    recorder = Recorder()
+    id, _ = recorder.message(0)
+    if outcome == "failed":
+        recorder.step(id, outcome=outcome)
+    else:
+        recorder.step(outcome=outcome, left=(id,))
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == ([("0", id)] if again else [])
+
+
+def test_a_message_that_was_consumed_before_it_came_is_answered_when_it_comes():
+    """Its publisher was killed before the recorder had it, and its successor sends it once more."""
+    recorder = Recorder()
+    recorder.step("counter.number#0")
+    assert recorder.message(0) == ("counter.number#0", [("worker", "input")])
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == []
+
+
+def test_a_message_that_comes_again_after_it_was_consumed_is_answered():
+    recorder = Recorder()
+    id, answered = recorder.message(0)
+    assert answered == []
+    assert recorder.message(0)[1] == []
+    recorder.step(id)
+    assert recorder.message(0)[1] == [("worker", "input")]
+    recorder.redelivery.appeared(Process("worker", 0, 1))
+    assert recorder.take() == []
+
+
+def test_of_policy_latest_only_the_newest_is_offered_again(monkeypatch: pytest.MonkeyPatch):
+    now = 100.0
+    monkeypatch.setattr(redelivery.time, "monotonic", lambda: now)
+    recorder = Recorder(policy="latest")
+    for number in range(3):
+        recorder.message(number)
+    recorder.redelivery.offer_latest()
+    assert recorder.take() == []
+    offered: list[float] = []
+    for tick in range(60):
+        now = 100 + tick / 10
+        recorder.redelivery.offer_latest()
+        offered += [now - 100 for _, id in recorder.take() if id == "counter.number#2"]
+    assert len(offered) == 3
+    recorder.step("counter.number#2")
+    now = 1000.0
+    recorder.redelivery.offer_latest()
+    assert recorder.take() == []
