@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import IO
 
@@ -57,7 +57,7 @@ class Registration:
 
 
 @contextlib.contextmanager
-def naming() -> Iterator[None]:
+def naming() -> Generator[None]:
     """Held by who chooses the name of a run and lists it: two that start together get different ones."""
     with (runtime_folder() / "naming").open("wb") as file:
         hold(file)

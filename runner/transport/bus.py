@@ -43,11 +43,17 @@ from runner.contract import Refused
 from runner.graph.graph import SUPERVISOR
 from runner.graph.placement import Network
 from runner.message.packet import Packet, Process
-from runner.transport.session import close_dead_links_at_once, new_endpoint, open_session, private
+from runner.transport.session import (
+    CLOSE_SECONDS,
+    close_dead_links_at_once,
+    close_session,
+    new_endpoint,
+    open_session,
+    private,
+)
 
 A = TypeVar("A")
 
-CLOSE_SECONDS = 1.0
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
 CHANNEL = 4096
@@ -223,8 +229,7 @@ class Bus:
         if threading.current_thread() is not self._caller:
             self._caller.join(CLOSE_SECONDS)
         for session in filter(None, (self._listener, self._session)):
-            with contextlib.suppress(zenoh.ZError):  # who is cut off cannot say goodbye
-                session.close()
+            close_session(session)
 
     def _in_turn(self, receive: Callable[[A], None]) -> Callback[A]:
         """A handler that only queues, so that it may run on the link's own thread."""

@@ -15,6 +15,7 @@ import shutil
 import socket
 import stat
 import struct
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 CALL_MS = 10_000
 """How long a tool calls a run that does not take the call."""
+CLOSE_SECONDS = 1.0
 GATEWAY_BATCHES = 16
 """Of 64 KiB that may wait for a listener; the most that Zenoh allows."""
 _UNIX = "unixsock-stream"
@@ -142,7 +144,7 @@ class Gateway:
 
     def close(self) -> None:
         """Lets all listeners go."""
-        self._session.close()
+        close_session(self._session)
 
 
 def open_session(
@@ -161,6 +163,18 @@ def open_session(
         where = ", ".join((*listen, *connect))
         reason = str(error).partition(" at /")[0]
         raise Refused(f"{where}: cannot be used: {reason}; is another graph running there?") from None
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Closes a session; does not wait for long for peers that do not take a goodbye, or are cut off."""
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()
+
+    closer = threading.Thread(target=close, name="close", daemon=True)
+    closer.start()
+    closer.join(CLOSE_SECONDS)
 
 
 def _config(

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,41 @@ class Mortality:
 
     marks: Path
     die_at: tuple[int, ...] = ()
+
+
+class Quitter(Stage):
+    """Doubles numbers; the first process to see a two leaves as a script would."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        way: Literal["quit", "interrupt"] = "quit"
+
+    def __init__(self, config: Config):
+        self._config = config
+
+    def on_number(self, number: Number, ctx: Context) -> Double:
+        if number.value == 2 and first_time(ctx.directory / "left"):
+            raise SystemExit(2) if self._config.way == "quit" else KeyboardInterrupt(2)
+        return Double(value=2 * number.value)
+
+
+class FragileSplitter(Stage):
+    """Splits like the toy splitter; of every second number its first process dies once it has sent some pieces."""
+
+    Config = Mortality
+
+    def __init__(self, config: Mortality):
+        self._config = config
+
+    def on_number(self, number: Number) -> Iterator[Piece]:
+        for index in range(4):
+            yield Piece(index=index, count=4, value=number.value)
+            if (
+                number.value % 2
+                and index == number.value // 2 % 4
+                and first_time(self._config.marks / str(number.value))
+            ):
+                os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Adder(Stage):

@@ -26,8 +26,7 @@ from runner.recording.writer import Manifest
 from runner.transport.bus import Bus, Presence
 from runner.transport.session import new_endpoint
 from tests.runner.survivors import Picture
-from tests.runner.test_runs import TOYS, finish, meeting_of, processes_of, read_until, run, start
-from tests.runner.test_survival import ALBUM, changed
+from tests.runner.test_runs import ALBUM, TOYS, changed, finish, meeting_of, processes_of, read_until, run, start
 from tests.runner.toys import Answer
 from tests.runner.waiting import wait_until
 

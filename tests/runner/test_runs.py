@@ -19,6 +19,7 @@ from runner.transport.bus import Bus
 HERE = Path(__file__).parent
 TOYS = HERE / "toys.yaml"
 DOUBLES = HERE / "doubles.yaml"
+ALBUM = HERE / "album.yaml"
 
 
 @dataclass
@@ -65,6 +66,29 @@ def read_until(process: subprocess.Popen[str], text: str) -> str:
         if text in line:
             return seen
     raise AssertionError(f"{text!r} never appeared:\n{seen}")
+
+
+def changed(source: Path, folder: Path, **changes: str) -> Path:
+    """A graph file with the classes of some stages replaced: ``Worker="Troubled"``."""
+    text = source.read_text()
+    for old, new in changes.items():
+        assert f"toys:{old}" in text
+        text = text.replace(f"tests.runner.toys:{old}", f"tests.runner.survivors:{new}")
+    path = folder / source.name
+    path.write_text(text)
+    return path
+
+
+def pid_of(folder: Path, name: str) -> int:
+    """The process that writes to a log of this run, for example ``doubler-0``."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            target = (entry / "fd/1").readlink()
+        except OSError:
+            continue
+        if folder in target.parents and target.name == f"{name}.txt":
+            return int(entry.name)
+    raise AssertionError(f"no process writes {name}.txt")
 
 
 def meeting_of(gateway: str) -> str:

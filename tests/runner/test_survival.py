@@ -18,34 +18,22 @@ from runner.recording.recording import Recording
 from tests.runner.machines import Party, on_loopback
 from tests.runner.survivors import lives, living
 from tests.runner.test_replay import verify
-from tests.runner.test_runs import DOUBLES, HERE, TOYS, Run, finish, processes_of, read_until, run, start
+from tests.runner.test_runs import (
+    ALBUM,
+    DOUBLES,
+    TOYS,
+    Run,
+    changed,
+    finish,
+    pid_of,
+    processes_of,
+    read_until,
+    run,
+    start,
+)
 from tests.runner.waiting import wait_until
 
-ALBUM = HERE / "album.yaml"
 ENDLESS = ("counter.count=100000", "counter.period=0.005", "sink.count=100000")
-
-
-def changed(source: Path, folder: Path, **changes: str) -> Path:
-    """A graph file with the classes of some stages replaced: ``Worker="Troubled"``."""
-    text = source.read_text()
-    for old, new in changes.items():
-        assert f"toys:{old}" in text
-        text = text.replace(f"tests.runner.toys:{old}", f"tests.runner.survivors:{new}")
-    path = folder / source.name
-    path.write_text(text)
-    return path
-
-
-def pid_of(folder: Path, name: str) -> int:
-    """The process that writes to a log of this run, for example ``doubler-0``."""
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            target = (entry / "fd/1").readlink()
-        except OSError:
-            continue
-        if folder in target.parents and target.name == f"{name}.txt":
-            return int(entry.name)
-    raise AssertionError(f"no process writes {name}.txt")
 
 
 def bodies(one: Run) -> dict[str, bytes]:
@@ -131,6 +119,32 @@ def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     assert (disturbed.code, disturbed.result) == (0, undisturbed.result), disturbed.output
     assert disturbed.output.count("restarts (") == 2
     assert all(body == bodies(undisturbed)[id] for id, body in bodies(disturbed).items() if "double" in id)
+    code, said = verify(disturbed.recording)
+    assert code == 0, said
+
+
+@pytest.mark.parametrize("way", ["quit", "interrupt"])
+def test_a_handler_that_leaves_the_process_has_failed(tmp_path: Path, way: str):
+    left = run(changed(DOUBLES, tmp_path, Doubler="Quitter"), tmp_path, f"doubler.way={way}")
+    name = {"quit": "SystemExit", "interrupt": "KeyboardInterrupt"}[way]
+    assert (left.code, left.result) == (0, ["0", "2", "4", "6", "8"]), left.output
+    assert re.search(rf"doubler restarts \(1 of 3\): {name}: 2 \(tests/runner/survivors.py:", left.output), left.output
+    recording = Recording(left.recording)
+    assert recording.verdict.complete
+    assert [step.outcome for step in recording.steps if step.stage == "doubler"].count("failed") == 1
+
+
+def test_what_a_publisher_took_with_it_is_sent_again(tmp_path: Path):
+    """Killed right after it has sent, again and again: to some consumers it has, to others it has not."""
+    calm, rough = tmp_path / "calm", tmp_path / "rough"
+    calm.mkdir()
+    rough.mkdir()
+    undisturbed = run(TOYS, calm, "counter.count=20")
+    graph = changed(TOYS, rough, Splitter="FragileSplitter")
+    disturbed = run(graph, rough, "counter.count=20", f"splitter.marks={rough}", "splitter.restarts=20")
+    assert (disturbed.code, disturbed.result) == (0, undisturbed.result), disturbed.output
+    assert disturbed.output.count("splitter restarts (") == 10
+    assert Recording(disturbed.recording).verdict.complete
     code, said = verify(disturbed.recording)
     assert code == 0, said
 

@@ -1,0 +1,123 @@
+"""Who may listen to a run, and speak: everybody hears everything where the graph says so, and forges nothing."""
+
+import contextlib
+import os
+import pwd
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from runner.message.codec import pack
+from runner.recording.recording import Recording
+from tests.runner.test_bad_input import public_address, run_of, stranger
+from tests.runner.test_runs import ALBUM, HERE, TOYS, changed, finish, meeting_of, read_until, start
+from tests.runner.waiting import wait_until
+
+EXAMPLE = HERE.parents[1] / "examples" / "listen.py"
+
+
+def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path: Path):
+    address = public_address()
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"listen={address}", f"counter.go={tmp_path / 'go'}", "counter.count=50")
+    heard: list[tuple[str, bytes]] = []
+    before = read_until(process, "run toys-")
+    with stranger(address) as session:
+        session.declare_subscriber(
+            f"{run_of(before)}/**", lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+        )
+        before += read_until(process, "processes are ready")
+        (tmp_path / "go").touch()
+        ended = finish(process, tmp_path, before)
+    assert ended.code == 0, ended.output
+    recording = Recording(ended.recording)
+    assert recording.verdict.complete
+    messages = [(key.partition("/m/")[2], payload) for key, payload in heard if "/m/" in key]
+    recorded = [(recording.messages[envelope.id].topic, pack(envelope)) for envelope in recording.envelopes()]
+    assert len(recorded) == 50 * 10 + 1
+    assert Counter(messages) == Counter(recorded)
+    steps = Counter(payload for key, payload in heard if "/s/" in key)
+    assert {pack(step): 1 for step in recording.steps}.items() <= steps.items()
+
+
+@contextlib.contextmanager
+def listening(address: str, run: str) -> Iterator[subprocess.Popen[str]]:
+    """The example, in a process of its own."""
+    command = [sys.executable, str(EXAMPLE), address, run]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "listening\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_hears(tmp_path: Path):
+    address = public_address()
+    process = start(ALBUM, tmp_path, f"listen={address}", f"camera.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    with listening(address, run_of(before)) as stopped, stranger(address) as session:
+        heard: list[str] = []
+        session.declare_subscriber(f"{run_of(before)}/m/camera/*", lambda sample: heard.append(str(sample.key_expr)))
+        os.kill(stopped.pid, signal.SIGSTOP)
+        time.sleep(0.5)
+        (tmp_path / "go").touch()
+        ended = finish(process, tmp_path, before)
+        wait_until(lambda: len(heard) == 60)
+    assert (ended.code, len(ended.result)) == (0, 60), ended.output
+    assert Recording(ended.recording).verdict.complete
+
+
+def test_the_example_shows_what_flows(tmp_path: Path):
+    address = public_address()
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"listen={address}", f"counter.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    with listening(address, run_of(before)) as listener:
+        (tmp_path / "go").touch()
+        assert listener.stdout is not None
+        shown = [listener.stdout.readline() for _ in range(10)]
+        assert finish(process, tmp_path, before).code == 0
+    assert "splitter.piece#19 Piece {'index': 3, 'count': 4, 'value': 4}\n" in shown
+
+
+INTRUDER = """
+import json, os, sys, zenoh
+os.setuid(int(sys.argv[1]))
+endpoint, run = sys.argv[2:]
+config = zenoh.Config.from_json5(json.dumps(
+    {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": 2000, "exit_on_failure": True}}
+))
+try:
+    with zenoh.open(config) as session:
+        session.put(f"{run}/m/sink/finished", b"nonsense")
+        print("in")
+except zenoh.ZError:
+    print("out")
+"""
+
+
+def test_another_user_of_the_machine_comes_in_nowhere(tmp_path: Path):
+    if os.getuid() != 0:
+        pytest.skip("needs the right to become another user")
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    gateway = before.partition(" on ")[2].split()[0]
+    found: dict[str, set[str]] = {}
+    for user in (str(os.getuid()), str(pwd.getpwnam("nobody").pw_uid)):
+        for endpoint in (gateway, meeting_of(gateway)):
+            command = [sys.executable, "-c", INTRUDER, user, endpoint, run_of(before)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            found.setdefault(user, set()).add(done.stdout.strip())
+    (tmp_path / "go").touch()
+    ended = finish(process, tmp_path, before)
+    assert list(found.values()) == [{"in"}, {"out"}]
+    assert ended.code == 0, ended.output
