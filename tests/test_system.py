@@ -26,6 +26,7 @@ OURS = {"sys.executable", "RERUN", "str(Path(rerun_cli.__file__).with_name('reru
 """Programs that come with Python, its packages or this project."""
 HANDED_ON = {
     "command[0]": "what a caller wants to be started",
+    "str(self._bin / program)": "of the environment that a test has made",
     "arguments": "this interpreter again",
     "command(method, options, out)": "this interpreter again",
     "_inside(self.spaces[host], folder) if self.spaces else []": "ip",
