@@ -190,7 +190,8 @@ def test_the_runner_alone_runs_records_and_replays(source: Path, tmp_path: Path)
     assert "heard HELLO 2" in alone.runner("up", "hello.yaml")
     (recording,) = (alone.folder / "recordings").glob("*.mcap")
     assert "identical" in alone.runner("replay", recording, "--verify")
-    assert "type: pip install 'scene-programming[view]'" in alone.runner("view", recording, code=2)
+    for command in (("view", recording), ("up", "hello.yaml", "--view")):
+        assert "type: pip install 'scene-programming[view]'" in alone.runner(*command, code=2)
     assert "type: pip install 'scene-programming[stages]'" in alone.runner("check", "tray", code=2)
 
 

@@ -35,7 +35,7 @@ def find_graph(path: Path) -> Path:
 
     Raises Refused where a bare name is neither.
     """
-    if path.suffix or len(path.parts) != 1 or path.exists():
+    if path.suffix or len(path.parts) != 1 or (path.exists() and not path.is_dir()):
         return locate(path, Path())
     graphs = {file.stem: file for folder in _graph_folders() for file in folder.glob("*.yaml")}
     if path.name not in graphs:

@@ -72,6 +72,9 @@ def test_what_no_package_brings_stays_where_it_was_said_to_be(package: Path, tmp
 
 def test_a_graph_is_found_by_its_name(package: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert find_graph(Path("told")) == package / "graphs/told.yaml"
+    Path("told").mkdir()
+    assert find_graph(Path("told")) == package / "graphs/told.yaml"
+    Path("told").rmdir()
     assert find_graph(Path("brought/graphs/told.yaml")) == package / "graphs/told.yaml"
     assert main(["check", "told"]) == 0
     assert main(["check", "tolt"]) == 2
