@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -43,15 +44,18 @@ def find_graph(path: Path) -> Path:
     return graphs[path.name]
 
 
-def _graph_folders() -> list[Path]:
-    folders = (_folder(found.value) for found in entry_points(group=GRAPHS))
-    return [folder for folder in folders if folder is not None]
+def _graph_folders() -> Iterator[Path]:
+    for found in entry_points(group=GRAPHS):
+        package, *inner = found.value.split(".")
+        folder = _folder(package)
+        if folder is not None:
+            yield folder.joinpath(*inner)
 
 
 def _folder(package: str) -> Path | None:
-    """Where an importable package lies; None where there is none of that name."""
+    """Where an importable package of the top level lies, without importing it; None where there is none."""
     try:
-        spec = find_spec(package) if all(map(str.isidentifier, package.split("."))) else None
+        spec = find_spec(package) if package.isidentifier() else None
     except (ImportError, ValueError):  # what is running as a script has no spec
         return None
     return Path(spec.origin).parent if spec and spec.origin and spec.submodule_search_locations else None

@@ -102,6 +102,8 @@ def test_only_what_lies_in_an_importable_package_has_a_portable_name(package: Pa
     stranger = tmp_path / "copy/brought/data/words.txt"
     assert portable_name(stranger) is None
     assert portable_name(tmp_path / "out.csv") is None
+    assert portable_name(tmp_path / "brought.stages" / "out.csv") is None
+    assert "brought" not in sys.modules
 
 
 def test_texts_that_can_be_no_path_are_no_files():
