@@ -153,7 +153,7 @@ def _scenes() -> None:
             # The first scene pays for compiling; with another seed nothing of it is remembered.
             for seed in (0, 1):
                 config = ParticleFilter.Config(
-                    catalogue=str(CATALOGUE), form=cast(Any, form), device=cast(Any, device), seed=seed
+                    catalogue=CATALOGUE, form=cast(Any, form), device=cast(Any, device), seed=seed
                 )
                 seconds, found = stage_seconds(ParticleFilter(config), seen)
             print(f"four objects through the stage, {form} form, {device}: {seconds:.2f} s, {worst(found, seen)}")

@@ -189,7 +189,7 @@ def _budget() -> None:
     observation = Observation(depth=scene.depth, rgb=rgb, foreground=scene.foreground, K=K,
                               T_camera_table=T_camera_table, T_base_camera=None)  # fmt: skip
     candidates = tuple(Candidate(box=box, label=label, confidence=0.9) for label, box in zip(SCENE, boxes, strict=True))
-    stage = ParticleFilter(ParticleFilter.Config(catalogue=str(CATALOGUE), form="paper"))
+    stage = ParticleFilter(ParticleFilter.Config(catalogue=CATALOGUE, form="paper"))
     start = time.process_time()
     stage.on_hypothesis(Hypothesis(index=0, count=1, candidates=candidates), observation, cast(Context, _Quiet()))
     seconds = time.process_time() - start

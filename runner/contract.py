@@ -172,5 +172,13 @@ class Stage:
     """True where what a handler does depends on earlier steps. A restarted process then executes again, silently,
     what its predecessors did, and a replay does the same. Devices cannot: their past lies outside."""
 
+    @classmethod
+    def examine(cls) -> str:
+        """Says in a line what the machine has of what the stage needs beside packages, for ``runner doctor``.
+
+        Raises Refused with what is missing and what to type. Runs in a process of its own.
+        """
+        return ""
+
     def close(self) -> None:
         """Releases what ``__init__`` took. Called once, on every orderly shutdown."""

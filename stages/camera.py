@@ -37,6 +37,13 @@ class SimulatedCamera(Stage):
         self._camera = simulated_camera.SimulatedCamera(Catalogue.load(config.catalogue))
         self._looks = 0
 
+    @classmethod
+    def examine(cls) -> str:
+        """Pictures are rendered without a display."""
+        from stages.devices.egl import examine_egl
+
+        return examine_egl()
+
     def on_snapshot(self, snapshot: Snapshot, ctx: Context) -> Frame:
         """The image from where the encoders say the camera is."""
         T_base_camera = self._fetch.camera_pose(snapshot.joint_names, snapshot.joint_positions)

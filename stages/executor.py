@@ -8,7 +8,7 @@ from pathlib import Path
 from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
-from stages.scene.catalogue import Catalogue
+from stages.scene.catalogue import BUILT_IN, Catalogue
 
 
 class Executor(Stage):
@@ -20,7 +20,7 @@ class Executor(Stage):
     class Config:
         """``attempts``: how many grasps are tried on an object before the transfer is reported as failed."""
 
-        catalogue: str = "stages/scene/catalogue.yaml"
+        catalogue: Path = BUILT_IN
         attempts: int = 3
 
         def __post_init__(self) -> None:
@@ -32,7 +32,7 @@ class Executor(Stage):
         from stages.planning.transfer import Routine, TransferRoutine
 
         self._config = config
-        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._catalogue = Catalogue.load(config.catalogue)
         self._robot = fetch.robot_model()
         self._transfers = TransferRoutine
         self._routine: Routine | None = None

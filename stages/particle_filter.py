@@ -29,7 +29,7 @@ class ParticleFilter(Stage):
     class Config:
         """Settings."""
 
-        catalogue: str
+        catalogue: Path
         """A catalogue's YAML file, or a BOP ``models`` folder."""
         form: Literal["default", "paper"] = "default"
         """``paper`` is the plain form of the paper: fixed diffusion, fixed scale, unbounded distances."""
@@ -66,7 +66,7 @@ class ParticleFilter(Stage):
             *config.without
         )
         settings = replace(settings, device=chosen_device(config.device, place="particle_filter.device"))
-        self._filter = SceneFilter(Catalogue.load(Path(config.catalogue)), settings, seed=config.seed)
+        self._filter = SceneFilter(Catalogue.load(config.catalogue), settings, seed=config.seed)
         self._filter.warm_up()
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:

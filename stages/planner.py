@@ -61,7 +61,7 @@ class Planner(Stage):
     class Config:
         """What to plan with, and where the robot can place."""
 
-        catalogue: str
+        catalogue: Path
         engine: str = search.BFS
         """``bfs``, or the name of an installed unified-planning engine."""
         gripper_width: float = 0.095
@@ -76,7 +76,7 @@ class Planner(Stage):
     def __init__(self, config: Config) -> None:
         search.check_engine(config.engine)
         self._config = config
-        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._catalogue = Catalogue.load(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
     def on_task(self, task: Task) -> Plan:

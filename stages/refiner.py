@@ -25,7 +25,7 @@ class Refiner(Stage):
     class Config:
         """Settings: those of the particle filter."""
 
-        catalogue: str
+        catalogue: Path
         """A catalogue's YAML file, or a BOP ``models`` folder."""
         form: Literal["default", "paper"] = "default"
         """``paper`` passes the ranked scene on as it is."""
@@ -44,7 +44,7 @@ class Refiner(Stage):
         self._refiner: SceneRefiner | None = None
         if config.form == "default":
             settings = RefinementSettings.of(FilterSettings(dof=config.dof).without(*config.without))
-            catalogue = Catalogue.load(Path(config.catalogue))
+            catalogue = Catalogue.load(config.catalogue)
             self._refiner = SceneRefiner(catalogue, settings)
             self._refiner.warm_up()
             self._judge = Judge(catalogue, dof=config.dof)

@@ -35,10 +35,10 @@ class Report(Stage):
     class Config:
         """What perception is scored with."""
 
-        catalogue: str
+        catalogue: Path
 
     def __init__(self, config: Config) -> None:
-        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._catalogue = Catalogue.load(config.catalogue)
         self._looks: list[tuple[int, Look]] = []
         self._plans: list[Plan] = []
         self._outcomes: dict[int, Outcome] = {}

@@ -24,7 +24,7 @@ class BopResults(Stage):
 
         path: str
         """The CSV to write; scene graphs go to the folder of the same name without the ending."""
-        catalogue: str
+        catalogue: Path
         """Tells the object numbers of BOP from names."""
 
         def __post_init__(self) -> None:
@@ -32,7 +32,7 @@ class BopResults(Stage):
                 raise Refused(f"results.path is '{self.path}'; it must end in .csv")
 
     def __init__(self, config: Config) -> None:
-        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._catalogue = Catalogue.load(config.catalogue)
         self._path = Path(config.path)
         self._graphs = self._path.with_suffix("")
         try:

@@ -22,7 +22,7 @@ class SceneGraphBuilder(Stage):
     class Config:
         """What counts as touching and as beside."""
 
-        catalogue: str
+        catalogue: Path
         gap: float = 0.06
         """Objects on the same support with less than this between their footprints are side by side, metres."""
         radius: float = 0.04
@@ -37,7 +37,7 @@ class SceneGraphBuilder(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        catalogue = Catalogue.load(Path(config.catalogue))
+        catalogue = Catalogue.load(config.catalogue)
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def on_scene_estimate(self, scene_estimate: SceneEstimate) -> SceneGraph:

@@ -12,7 +12,7 @@ from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
 from stages.messages import Arrange, Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
-from stages.scene.catalogue import Catalogue
+from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01
 """Metres that an object may move while the scene settles before the arrangement counts as failed."""
@@ -30,7 +30,7 @@ class World(Stage):
     class Config:
         """``seed`` draws the scenes; ``goal`` is a goal template by name or ``auto`` (chosen by the seed)."""
 
-        catalogue: str = "stages/scene/catalogue.yaml"
+        catalogue: Path = BUILT_IN
         seed: int = 0
         goal: str = "auto"
 
@@ -41,7 +41,7 @@ class World(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._catalogue = Catalogue.load(Path(config.catalogue))
+        self._catalogue = Catalogue.load(config.catalogue)
         self._goal = tabletop.goal_name(config.goal, config.seed)
         self._simulation = Simulation(self._catalogue, tabletop.object_names(self._goal))
 

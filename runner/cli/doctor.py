@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib.metadata
 import os
 import re
@@ -16,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.contract import Refused, Stage
+from runner.graph.graph import Node, load_class, load_graph
 from runner.inspect.info import byte_count
 from runner.live.tables import from_here
 from runner.transport.bus import Bus
@@ -29,9 +28,6 @@ LEAST_MEMORY = 2 * 10**9
 LEAST_FILES = 1024
 LEAST_PROCESSES = 256
 PROBE_SECONDS = 20
-_EGL_PLATFORM_SURFACELESS = 0x31DD
-_EGL_VENDOR, _EGL_VERSION = 0x3053, 0x3054
-_EGL_OPENGL_API = 0x30A2
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +53,6 @@ def examine(recordings: Path) -> Iterator[Finding]:
     checks: tuple[tuple[str, Callable[[], Iterable[Finding]]], ...] = (
         ("python", _python),
         ("packages", _packages),
-        ("EGL", _egl),
         ("loopback", _loopback),
         ("zenoh", _zenoh),
         ("runs", _runs),
@@ -73,14 +68,41 @@ def examine(recordings: Path) -> Iterator[Finding]:
 
 
 def examine_graph(path: Path) -> Iterator[Finding]:
-    """Whether a graph is well-formed and all that its stages import is here."""
+    """Whether a graph is well-formed, all that its stages import is here, and the machine has what they ask for."""
     try:
         graph = load_graph(path)
     except Refused as refusal:
         for line in str(refusal).splitlines():
             yield Finding("bad", "graph", line)
-    else:
-        yield Finding("good", "graph", f"{path}: {len(graph.nodes)} stages can be imported")
+        return
+    yield Finding("good", "graph", f"{path}: {len(graph.nodes)} stages can be imported")
+    for node in graph.nodes.values():
+        if node.type.cls.examine.__func__ is not Stage.examine.__func__:
+            yield _ask(node)
+
+
+def _ask(node: Node) -> Finding:
+    """What a stage says of the machine, in a process of its own: a broken driver takes its process with it."""
+    command = [sys.executable, "-c", "from runner.cli.doctor import answer; answer()", node.stage]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    try:
+        said = subprocess.run(
+            command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False, env=environment
+        )
+    except subprocess.TimeoutExpired:
+        return Finding("bad", node.name, f"what it needs hangs: no answer in {PROBE_SECONDS} s")
+    if said.returncode == 0:
+        return Finding("good", node.name, said.stdout.strip())
+    return Finding("bad", node.name, (said.stderr.splitlines() or [f"its process ended with {said.returncode}"])[-1])
+
+
+def answer() -> None:
+    """Prints what the stage class named on the command line says of the machine."""
+    cls: type[Stage] = load_class(sys.argv[1], sys.argv[1])
+    try:
+        print(cls.examine())
+    except Refused as refusal:
+        sys.exit(str(refusal))
 
 
 # ------------------------------------------------------------------------------------------ versions
@@ -100,11 +122,11 @@ def _packages() -> Iterator[Finding]:
         if "extra ==" not in text
     ]
     absent = [name for name in needed if _version(name) is None]
-    install = f"{sys.executable} -m pip install --constraint constraints.txt --editable ."
+    tested = _tested()
+    install = f"{sys.executable} -m pip install {'--constraint constraints.txt --editable .' if tested else project}"
     if absent:
         yield Finding("bad", "packages", f"missing: {', '.join(absent)}", install)
         return
-    tested = _tested()
     other = [
         f"{name} {_version(name)} instead of {tested[key]}"
         for name in needed
@@ -124,7 +146,7 @@ def _version(name: str) -> str | None:
 
 
 def _tested() -> dict[str, str]:
-    path = Path(__file__).parents[1] / "constraints.txt"
+    path = Path(__file__).parents[2] / "constraints.txt"
     lines = path.read_text().splitlines() if path.exists() else []
     pairs = (line.split("==") for line in lines if "==" in line and not line.startswith("#"))
     return {_key(name): version.strip() for name, version in pairs}
@@ -132,52 +154,6 @@ def _tested() -> dict[str, str]:
 
 def _key(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
-
-
-# ------------------------------------------------------------------------------------------ rendering
-
-
-def _egl() -> Iterator[Finding]:
-    """In a process of its own: a broken driver takes its process with it."""
-    command = [sys.executable, "-c", "from runner.cli.doctor import probe_egl; print(probe_egl())"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    remedy = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or the driver of the graphics card)"
-    try:
-        found = subprocess.run(
-            command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False, env=environment
-        )
-    except subprocess.TimeoutExpired:
-        yield Finding("bad", "EGL", f"the driver hangs: no answer in {PROBE_SECONDS} s", remedy)
-        return
-    if found.returncode == 0:
-        yield Finding("good", "EGL", found.stdout.strip())
-    else:
-        reason = (found.stderr.strip().splitlines() or [f"its process ended with {found.returncode}"])[-1]
-        yield Finding("bad", "EGL", f"no picture can be rendered without a display: {reason}", remedy)
-    platform = os.environ.get("PYOPENGL_PLATFORM", "egl")
-    if platform != "egl":
-        yield Finding("note", "EGL", f"PYOPENGL_PLATFORM={platform} keeps PyOpenGL from it", "unset PYOPENGL_PLATFORM")
-
-
-def probe_egl() -> str:
-    """Opens a display without a screen and names it; raises OSError with what does not work."""
-    egl = ctypes.CDLL("libEGL.so.1")
-    egl.eglGetProcAddress.restype = egl.eglQueryString.restype = ctypes.c_void_p
-    address = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
-    if not address:
-        raise OSError("libEGL.so.1 knows no platforms (eglGetPlatformDisplayEXT)")
-    prototype = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)
-    display = ctypes.c_void_p(prototype(address)(_EGL_PLATFORM_SURFACELESS, None, None))
-    major, minor = ctypes.c_int(), ctypes.c_int()
-    if not display or not egl.eglInitialize(display, ctypes.byref(major), ctypes.byref(minor)):
-        raise OSError(f"no display could be opened (EGL error {egl.eglGetError():#x})")
-    if not egl.eglBindAPI(_EGL_OPENGL_API):
-        raise OSError("the driver has OpenGL ES only")
-    texts = (
-        ctypes.cast(egl.eglQueryString(display, name), ctypes.c_char_p).value for name in (_EGL_VERSION, _EGL_VENDOR)
-    )
-    version, vendor = ((text or b"").decode() for text in texts)
-    return f"{version} by {vendor}, with OpenGL and without a display"
 
 
 # ------------------------------------------------------------------------------------------ transport

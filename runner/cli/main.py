@@ -17,11 +17,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status; what is refused is one line on stderr."""
     built = parser()
     complete_and_exit(built)
-    options = built.parse_args(arguments)
-    options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     sys.path.insert(0, os.getcwd())  # noqa: PTH109 - as `python -m` does: stages beside the graph can be named
-    command: Command = options.command
     try:
+        options = built.parse_args(arguments)
+        options.arguments = list(sys.argv[1:] if arguments is None else arguments)
+        command: Command = options.command
         return command(options)
     except Refused as refusal:
         print(refusal, file=sys.stderr)

@@ -10,6 +10,8 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import metadata, packages_distributions
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -18,6 +20,7 @@ from msgspec import Meta
 
 from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.graph.document import Document, Keys, read_document, suggest
+from runner.graph.packaged import locate
 from runner.graph.placement import ALONE, Layout, read_layout, read_listen, read_placement
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
 
@@ -309,7 +312,9 @@ def node_from_entry(name: str, entry: dict[str, Any]) -> Node:
     """Reads back what :func:`node_entry` wrote, without the rest of the graph and so without importing it."""
     document = Document(name, Path.cwd(), {"stages": {name: _unplaced(entry)}})
     read = _read_entry(document, name)
-    return _node(document, name, read, _load(document, name, read))
+    kind = _load(document, name, read)
+    _absolute_paths(document, {name: read}, {name: kind})
+    return _node(document, name, read, kind)
 
 
 def graph_from_json(text: str, label: str = "graph") -> Graph:
@@ -443,7 +448,7 @@ def load_class(reference: str, place: str) -> Any:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not (module_name == error.name or module_name.startswith(f"{error.name}.")):
-            raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
+            raise Refused(f"{place}: {module_name} cannot be imported: {error}{_extra(module_name)}") from None
         raise Refused(
             f"{place}: no module {module_name!r}{suggest(module_name, _modules_beside(module_name))}"
         ) from None
@@ -454,6 +459,15 @@ def load_class(reference: str, place: str) -> Any:
             f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, _classes_of(module_name))}"
         )
     return getattr(module, class_name)
+
+
+@cache
+def _extra(module_name: str) -> str:
+    """What to type where a package may be there without its extra of the same name."""
+    package = module_name.partition(".")[0]
+    owners = packages_distributions().get(package, ())
+    found = [owner for owner in owners if package in (metadata(owner).get_all("Provides-Extra") or ())]
+    return f"; type: pip install '{found[0]}[{package}]'" if found else ""
 
 
 def _modules_beside(module_name: str) -> list[str]:
@@ -492,7 +506,9 @@ def _absolute_paths(document: Document, entries: Mapping[str, StageEntry], types
                 and "${" not in value
                 and value != MISSING
             ):
-                entry.config[key] = str(document.folder_of("stages", name, "config", key) / Path(value).expanduser())
+                entry.config[key] = str(
+                    locate(Path(value).expanduser(), document.folder_of("stages", name, "config", key))
+                )
 
 
 def _path_settings(config: type[Any] | None) -> set[str]:

@@ -26,11 +26,12 @@ import msgspec
 
 from runner.contract import Level, Refused
 from runner.graph.document import Document, read_document, suggest
+from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
 from runner.hosts.keys import credentials
 from runner.message.packet import Packet, Process
 from runner.process.stage_process import Assignment
-from runner.recording.provenance import fingerprint, machine, package_versions, revision
+from runner.recording.provenance import fingerprint, machine, package_versions, revision, with_texts
 from runner.transport.bus import Bus
 from runner.transport.session import Router, private
 
@@ -378,17 +379,13 @@ def differences(own: Any, theirs: Any, key: str = "") -> Iterator[tuple[str, str
 
 
 def moved(value: Any, folders: Mapping[str, str]) -> Any:
-    """A copy of a tree in which paths below one folder are below another."""
-    match value:
-        case str():
-            start = next((old for old in folders if value.startswith(f"{old}/")), None)
-            return value if start is None else folders[start] + value[len(start) :]
-        case dict():
-            return {key: moved(inner, folders) for key, inner in cast("dict[str, Any]", value).items()}
-        case list():
-            return [moved(inner, folders) for inner in cast("list[Any]", value)]
-        case _:
-            return value
+    """A copy of a tree in which paths below one folder are below another, and each host finds its own packages."""
+
+    def there(text: str) -> str:
+        start = next((old for old in folders if text.startswith(f"{old}/")), None)
+        return portable_name(Path(text)) or (text if start is None else folders[start] + text[len(start) :])
+
+    return with_texts(value, there)
 
 
 def _read(file: Path, offset: int) -> bytes:

@@ -2,15 +2,18 @@
 
 import hashlib
 import itertools
+import os
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import yaml
+
+from runner.graph.packaged import locate, portable_name
 
 NUMERICAL = ("llvmlite", "mujoco", "numba", "numpy", "opencv-contrib-python-headless", "pyrender", "scipy", "torch")
 """Packages that compute: another version may round a float differently."""
@@ -78,12 +81,14 @@ def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of everything that a setting of the graph names: files, folders with all that is in them, and YAML files
     with the files they name, for example the catalogue with its meshes."""
     texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
-    hashes = {text: _hash(_parts(Path(text))) for text in sorted(texts) if len(text) < 4096 and "\0" not in text}
+    files = {text: locate(Path(text), Path()) for text in sorted(texts)}
+    there = {text: file for text, file in files.items() if os.path.exists(file)}  # noqa: PTH110 - takes any text
+    hashes = {text: _hash(_parts(file)) for text, file in there.items()}
     return {text: found for text, found in hashes.items() if found}
 
 
 def _parts(path: Path) -> list[Path]:
-    """The files that belong to a setting's file or folder; none where there is neither."""
+    """The files that belong to a setting's file or folder; none where it is neither."""
     if path.is_dir():
         return sorted(inner for inner in itertools.islice(path.rglob("*"), HASHED_FILES) if inner.is_file())
     if not path.is_file():
@@ -121,13 +126,23 @@ def _hash(paths: Sequence[Path]) -> str:
 
 
 def portable(value: Any, root: Path) -> Any:
-    """A copy of a tree in which paths below ``root`` are relative to it: another checkout finds its own files."""
+    """A copy of a tree in which paths inside packages or below ``root`` are relative: others find their own files."""
+
+    def relative(text: str) -> str:
+        below = text.startswith(f"{root}/")
+        return portable_name(Path(text)) or (str(Path(text).relative_to(root)) if below else text)
+
+    return with_texts(value, relative)
+
+
+def with_texts(value: Any, change: Callable[[str], str]) -> Any:
+    """A copy of a tree with every text in it changed."""
     match value:
-        case str() if value.startswith(f"{root}/"):
-            return str(Path(value).relative_to(root))
+        case str():
+            return change(value)
         case dict():
-            return {key: portable(inner, root) for key, inner in cast("dict[str, Any]", value).items()}
+            return {key: with_texts(inner, change) for key, inner in cast("dict[str, Any]", value).items()}
         case list():
-            return [portable(inner, root) for inner in cast("list[Any]", value)]
+            return [with_texts(inner, change) for inner in cast("list[Any]", value)]
         case _:
             return value

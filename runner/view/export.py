@@ -16,20 +16,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from runner.contract import Level, Refused
 from runner.graph.graph import graph_from_json
 from runner.message.codec import LogLine
 from runner.recording.recording import Recording
 from runner.view import drawing as d
-from runner.view.rerun_view import drawn, load_views
+from runner.view.views import drawn, load_views
 
 if TYPE_CHECKING:
     from foxglove import messages as fox
+    from scipy.spatial.transform import Rotation
 else:
     try:
         from foxglove import messages as fox
+        from scipy.spatial.transform import Rotation
     except ImportError:
         fox = None
 

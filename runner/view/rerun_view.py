@@ -6,7 +6,6 @@ A running graph is shown from the recording it writes: however slow the viewer i
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import shutil
 import socket
@@ -15,7 +14,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import cast
 from urllib.parse import quote
 
 import rerun as rr
@@ -23,13 +21,14 @@ import rerun_cli
 from mcap.records import Metadata
 
 from runner.contract import Refused
-from runner.graph.graph import Graph, graph_from_json, node_entry
-from runner.message.codec import CodecError, Envelope, open_envelope, unpack
+from runner.graph.graph import Graph, graph_from_json
+from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
-from runner.recording.recording import JOURNAL, LOG, RUN, Recording, split_id
+from runner.recording.recording import JOURNAL, LOG, RUN, Recording
 from runner.view.canvas import Canvas
-from runner.view.drawing import Drawing, Views
+from runner.view.drawing import Views
+from runner.view.views import drawn, load_views
 
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 """The viewer itself: ``python -m rerun`` would stay between it and the signals that end it."""
@@ -53,32 +52,6 @@ class Show:
     def draw(self, sealed: Envelope) -> None:
         """Draws one message; what cannot be drawn is named on stderr and left out."""
         self._canvas.show(drawn(self._graph, self._views, sealed), time_ns=sealed.time_ns)
-
-
-def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
-    """What one message shows; what cannot be drawn is named on stderr and left out."""
-    stage, _, port = split_id(sealed.id)[0].partition(".")
-    found: list[Drawing] = []
-    try:
-        kind = graph.outputs_of(stage).get(port)
-        if kind is not None:
-            found.extend(views.draw(open_envelope(kind, sealed)))
-    except Exception as error:  # the rest of the recording is still worth seeing
-        reason = str(error).partition("\n")[0]
-        print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
-    return found
-
-
-def load_views(graph: Graph) -> Views:
-    """The views a graph names; raises Refused where it names none or they cannot be loaded."""
-    if graph.view is None:
-        raise Refused(f"graph {graph.name!r} names no views; valid: a line `view: module:Class` in the graph file")
-    module, _, name = graph.view.partition(":")
-    try:
-        views = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise Refused(f"view {graph.view!r} of graph {graph.name!r} cannot be loaded: {error}") from None
-    return cast("Views", views({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
 
 
 # ------------------------------------------------------------------------------------ recordings

@@ -17,7 +17,7 @@ from stages.perception.depth_noise import color_noise
 from stages.perception.detection_network import HEIGHT, WIDTH, fit
 from stages.perception.renderer import Camera, Item, Renderer
 from stages.perception.training_images import Example, labelled, render_example, save_examples
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import BUILT_IN, Catalogue, Floats
 
 
 def examples(
@@ -74,7 +74,7 @@ def main() -> None:
     """Reads the command line and writes the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--catalogue", type=Path, default=Path("stages/scene/catalogue.yaml"))
+    parser.add_argument("--catalogue", type=Path, default=BUILT_IN)
     parser.add_argument("--layouts", type=int, default=600)
     parser.add_argument("--views", type=int, default=6)
     parser.add_argument("--seed", type=int, default=1)

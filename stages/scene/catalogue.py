@@ -19,6 +19,8 @@ from stages.scene.distinct import distinct_rows
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 GraspKind = Literal["top", "side"]
+BUILT_IN = Path(__file__).with_name("catalogue.yaml")
+"""The catalogue that comes with the package."""
 
 _AGGRESSIVENESS = (3.0, 5.0, 7.0)
 """Of mesh simplification: how fast its tolerance grows."""

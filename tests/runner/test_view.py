@@ -15,7 +15,8 @@ from runner.graph.graph import load_graph
 from runner.message.codec import Envelope, envelope, pack
 from runner.recording.recording import Recording
 from runner.recording.writer import RecordingWriter
-from runner.view.rerun_view import follow, load_views, newest_live, save_rrd, screenshot, view_recording
+from runner.view.rerun_view import follow, newest_live, save_rrd, screenshot, view_recording
+from runner.view.views import load_views
 from tests.runner.recordings import TOYS, manifest, record_toys
 from tests.runner.toys import Number
 

@@ -11,8 +11,9 @@ import numpy as np
 from runner.contract import Level
 from stages.messages import Assertion, Outcome, Plan, SceneGraph, Transfer, VirtualObject
 from stages.messages.scene import SceneObject
+from stages.scene.catalogue import BUILT_IN
 
-CATALOGUE = "stages/scene/catalogue.yaml"
+CATALOGUE = BUILT_IN
 CONCAVE = {"tray", "bowl", "cup", "mug"}
 K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
 TABLE_HEIGHT = 0.7

@@ -37,7 +37,7 @@ def stances(label: str) -> Stances:
 
 @cache
 def builder() -> SceneGraphBuilder:
-    return SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=str(CATALOGUE)))
+    return SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=CATALOGUE))
 
 
 @dataclass

@@ -132,12 +132,12 @@ def test_settings_are_checked(field: dict) -> None:
 )
 def test_filter_settings_are_checked(field: dict) -> None:
     with pytest.raises(Refused, match=f"particle_filter.{next(iter(field))} is"):
-        ParticleFilter.Config(catalogue=str(CATALOGUE_FILE), **field)
+        ParticleFilter.Config(catalogue=CATALOGUE_FILE, **field)
 
 
 @pytest.fixture(scope="module")
 def filter_stage() -> ParticleFilter:
-    return ParticleFilter(ParticleFilter.Config(catalogue=str(CATALOGUE_FILE), iterations=60))
+    return ParticleFilter(ParticleFilter.Config(catalogue=CATALOGUE_FILE, iterations=60))
 
 
 def test_the_true_scene_outweighs_the_false_one(seen: Rendered, filter_stage: ParticleFilter) -> None:
@@ -232,7 +232,7 @@ def test_results_survive_the_round_trip(seen: Rendered, tmp_path: Path) -> None:
     estimate = estimate_of(poses)
     graph = SceneGraph(objects=(), virtual_objects=(), assertions=(), T_base_table=np.eye(4), T_base_camera=None, K=K)
     path = tmp_path / "deep" / "out.csv"
-    stage = BopResults(BopResults.Config(path=str(path), catalogue=str(CATALOGUE_FILE)))
+    stage = BopResults(BopResults.Config(path=str(path), catalogue=CATALOGUE_FILE))
     answer = stage.on_scene_graph(frame(seen), estimate, graph, ctx)
     assert isinstance(answer, Finished) and answer.code == 0
     results = read_results(path)
@@ -252,7 +252,7 @@ def test_a_broken_result_file_names_its_line(tmp_path: Path) -> None:
     with pytest.raises(Refused, match=r"out.csv:2: not a line of"):
         read_results(path)
     with pytest.raises(Refused, match=r"must end in \.csv"):
-        BopResults.Config(path="out.txt", catalogue="")
+        BopResults.Config(path="out.txt", catalogue=CATALOGUE_FILE)
 
 
 def test_scores_match_each_result_once_and_count_what_is_missing() -> None:
@@ -280,7 +280,7 @@ def test_data_sets_with_exact_boxes(name: str, dof: Literal[3, 6], images: int) 
     detector = RecordedDetections(
         RecordedDetections.Config(detections=dataset / "detections_exact.json", catalogue=models)
     )
-    particle_filter = ParticleFilter(ParticleFilter.Config(catalogue=str(models), dof=dof))
+    particle_filter = ParticleFilter(ParticleFilter.Config(catalogue=models, dof=dof))
     ctx = Recorded()
     results: list[Result] = []
     for image in DatasetCamera(DatasetCamera.Config(dataset=dataset, limit=images)).source(ctx):

@@ -33,8 +33,8 @@ class Bench:
 
     def __init__(self, seed: int, goal: str) -> None:
         self.ctx = StepContext(np.random.default_rng(seed))
-        self.world = World(World.Config(catalogue=str(CATALOGUE_FILE), seed=seed, goal=goal))
-        self.executor = Executor(Executor.Config(catalogue=str(CATALOGUE_FILE), attempts=2))
+        self.world = World(World.Config(catalogue=CATALOGUE_FILE, seed=seed, goal=goal))
+        self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, attempts=2))
         self.world.on_arrangement(Arrangement(kind="start"), self.ctx)
 
     def poses(self) -> dict[str, Floats]:

@@ -20,7 +20,7 @@ from tests.stages.layouts import CATALOGUE, T_BASE_TABLE, Layout, breakfast, cat
 
 @cache
 def planner() -> Planner:
-    return Planner(Planner.Config(catalogue=str(CATALOGUE)))
+    return Planner(Planner.Config(catalogue=CATALOGUE))
 
 
 def plan(goal: Layout, current: Layout, *, avoid: tuple[str, ...] = ()) -> Plan:
@@ -240,7 +240,7 @@ def test_goals_that_cannot_be_reached_are_refused(case: str):
 
 
 def test_what_is_wider_than_the_gripper_is_refused():
-    narrow = Planner(Planner.Config(catalogue=str(CATALOGUE), gripper_width=0.06))
+    narrow = Planner(Planner.Config(catalogue=CATALOGUE, gripper_width=0.06))
     goal, start = (
         Layout().put("tea_box", 0, 0).put("soup_can", 0, 0, on="tea_box"),
         Layout().put("tea_box", 0, 0).put("soup_can", 0, 0.3),
@@ -265,7 +265,7 @@ def test_objects_that_rest_on_each_other_in_the_goal_are_refused():
 
 
 def test_without_room_within_reach_the_task_is_refused():
-    cramped = Planner(Planner.Config(catalogue=str(CATALOGUE), workspace=Workspace(x=(0.59, 0.61), y=(-0.01, 0.01))))
+    cramped = Planner(Planner.Config(catalogue=CATALOGUE, workspace=Workspace(x=(0.59, 0.61), y=(-0.01, 0.01))))
     goal = Layout().put("tea_box", 0, 0).put("tuna_can", 0, 0, on="tea_box")
     start = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box").put("tuna_can", 0.1, 0.2)
     found = cramped.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()))
@@ -276,4 +276,4 @@ def test_settings_are_checked():
     with pytest.raises(Refused, match=r"planner.workspace.x=\[1.0, 0.5\]: must be \[lowest, highest\]"):
         Workspace(x=(1.0, 0.5))
     with pytest.raises(Refused, match=r"planner\.gripper_width=0: must be a positive"):
-        Planner.Config(catalogue=str(CATALOGUE), gripper_width=0)
+        Planner.Config(catalogue=CATALOGUE, gripper_width=0)

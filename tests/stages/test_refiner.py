@@ -24,7 +24,7 @@ def seen() -> Rendered:
 
 @pytest.fixture(scope="module")
 def stage() -> Refiner:
-    return Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE)))
+    return Refiner(Refiner.Config(catalogue=CATALOGUE_FILE))
 
 
 def observation(seen: Rendered) -> Observation:
@@ -68,7 +68,7 @@ def test_the_scene_is_judged(seen: Rendered, stage: Refiner) -> None:
 
 
 def test_the_plain_form_passes_the_scene_on(seen: Rendered) -> None:
-    plain = Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), form="paper"))
+    plain = Refiner(Refiner.Config(catalogue=CATALOGUE_FILE, form="paper"))
     before = estimate(seen)
     assert plain.on_scene_estimate(before, observation(seen), Recorded()) is before
 
@@ -80,10 +80,10 @@ def test_a_scene_without_objects_stays_one(seen: Rendered, stage: Refiner) -> No
 
 def test_what_is_unknown_cannot_be_switched_off() -> None:
     with pytest.raises(Refused, match="'colours' is no improvement"):
-        Refiner(Refiner.Config(catalogue=str(CATALOGUE_FILE), without=("colours",)))
+        Refiner(Refiner.Config(catalogue=CATALOGUE_FILE, without=("colours",)))
 
 
 @pytest.mark.parametrize("field", [{"dof": 4}, {"form": "best"}])
 def test_settings_are_checked(field: dict) -> None:
     with pytest.raises(Refused, match=f"refiner.{next(iter(field))} is"):
-        Refiner.Config(catalogue=str(CATALOGUE_FILE), **field)
+        Refiner.Config(catalogue=CATALOGUE_FILE, **field)

@@ -42,4 +42,4 @@ def test_objects_that_the_catalogue_does_not_hold_are_refused():
 @pytest.mark.parametrize("field", ["gap", "radius"])
 def test_distances_must_be_positive(field: str):
     with pytest.raises(Refused, match=f"scene_graph.{field}=0: must be a positive number of metres"):
-        SceneGraphBuilder.Config(catalogue=str(CATALOGUE), **{field: 0})
+        SceneGraphBuilder.Config(catalogue=CATALOGUE, **{field: 0})

@@ -23,8 +23,17 @@ def add(commands: Commands, name: str, command: Command, text: str) -> argparse.
 
 def add_graph(parser: argparse.ArgumentParser) -> None:
     """Adds a graph file and the settings that change it."""
-    parser.add_argument("graph", type=Path, metavar="GRAPH", help="a graph file")
+    parser.add_argument(
+        "graph", type=graph_file, metavar="GRAPH", help="a graph file, or the name of one that a package brings"
+    )
     add_settings(parser)
+
+
+def graph_file(text: str) -> Path:
+    """Reads an argument that names a graph: a file, or a graph that a package brings."""
+    from runner.graph.packaged import find_graph
+
+    return find_graph(Path(text))
 
 
 def add_file(parser: argparse.ArgumentParser) -> None:

@@ -28,7 +28,10 @@ def _up(options: argparse.Namespace) -> int:
     from runner.graph.graph import load_graph
     from runner.supervise.supervisor import Supervisor
     from runner.terminal import Terminal
+    from runner.view.views import require_viewer
 
+    if options.view:
+        require_viewer()
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     settings = (*options.settings, *seed)
     host = None if options.here else _chosen_host(options.graph, settings, options.host)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from runner.cli.commands import Commands, add
+from runner.cli.commands import Commands, add, graph_file
 from runner.cli.completion import SHELLS
 
 
 def add_commands(commands: Commands) -> None:
     """Adds the commands of this group."""
     doctor = add(commands, "doctor", _doctor, "say what would keep a graph from running here, and what to type")
-    doctor.add_argument("graph", type=Path, metavar="GRAPH", nargs="?", help="also whether this graph could start")
+    text = "also whether this graph could start, and what its stages need of the machine"
+    doctor.add_argument("graph", type=graph_file, metavar="GRAPH", nargs="?", help=text)
     doctor.add_argument(
         "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go"
     )

@@ -29,6 +29,9 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
+    from runner.view.views import require_viewer
+
+    require_viewer()
     from runner.view.rerun_view import view_live, view_recording
 
     if options.live:

@@ -25,7 +25,7 @@ def test_auto_is_the_cpu_where_there_is_no_gpu() -> None:
 
 @pytest.mark.skipif(HAS_GPU, reason="a GPU is at hand")
 def test_a_gpu_that_is_not_there_is_refused_in_one_line() -> None:
-    config = ParticleFilter.Config(catalogue=str(CATALOGUE_FILE), device="cuda")
+    config = ParticleFilter.Config(catalogue=CATALOGUE_FILE, device="cuda")
     with pytest.raises(Refused) as refusal:
         ParticleFilter(config)
     assert str(refusal.value).startswith("particle_filter.device is 'cuda', but numba finds no GPU (")

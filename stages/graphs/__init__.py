@@ -1,0 +1,1 @@
+"""Graphs that come with the package: ``runner up tray`` finds them from any folder."""
