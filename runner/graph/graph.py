@@ -1,12 +1,9 @@
 """A graph of stages, checked: every key, setting, class and edge, before anything starts."""
 
-import importlib
 import json
 import math
 import os
-import pkgutil
 import re
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,6 +17,7 @@ from runner.contract import Command, Finished, Message, Part, Refused, Restarted
 from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.placement import ALONE, Layout, read_layout, read_placement
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
+from runner.graph.references import load_class, load_migrations, load_tolerances
 
 T = TypeVar("T")
 K = TypeVar("K")
@@ -32,6 +30,10 @@ FINISHED = port_name(Finished)
 RESTARTS = 3
 """Restarts of one process before the graph ends. None for devices: what they drive has moved on meanwhile."""
 QUEUE = 64
+GRAPH_KEYS = ("name", "seed", "view", "score", "tolerances", "migrations", "numerical")
+"""Of a graph, beside its stages and hosts."""
+NUMERICAL = ("numpy",)
+"""The packages that compute where a graph names none."""
 
 
 class EdgeEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -93,6 +95,12 @@ class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerances: Annotated[
         str | None, Meta(description="module:NAME of the table of how far fields may be off on another machine")
     ] = None
+    migrations: Annotated[
+        str | None, Meta(description="module:NAME of the table of what has become of messages since they were recorded")
+    ] = None
+    numerical: Annotated[
+        tuple[str, ...], Meta(description="Packages that compute: another version may round a float differently")
+    ] = NUMERICAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +197,11 @@ class Graph:
     seed: int
     view: str | None
     nodes: dict[str, Node]
+    """By name."""
     score: str | None = None
     tolerances: str | None = None
+    migrations: str | None = None
+    numerical: tuple[str, ...] = NUMERICAL
     layout: Layout = ALONE
 
     def host_of(self, stage: str, replica: int) -> str | None:
@@ -249,13 +260,16 @@ def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
     document = read_document(path)
     for assignment in assignments:
         document.set(assignment)
-    return _build(document)
+    graph = _build(document)
+    load_tolerances(graph.tolerances, document.place("tolerances"))
+    load_migrations(graph.migrations, document.place("migrations"))
+    return graph
 
 
 def graph_to_json(graph: Graph) -> str:
     """The graph as it runs, every setting written out: what processes are given and recordings keep."""
     stages = {node.name: node_entry(node) for node in graph.nodes.values()}
-    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "score", "tolerances")}
+    keys = {key: getattr(graph, key) for key in GRAPH_KEYS}
     return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
 
 
@@ -311,7 +325,7 @@ def _build(document: Document) -> Graph:
     _resolve_settings(document, entries, types)
     nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
     layout = read_layout(document)
-    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout)
+    checked = Graph(**{key: getattr(graph, key) for key in GRAPH_KEYS}, nodes=nodes, layout=layout)
     _collect(
         lambda keys: _check_edge(document, checked, *keys),
         [(node, port) for node in names for port in nodes[node].inputs],
@@ -407,41 +421,6 @@ def _load(document: Document, name: str, entry: StageEntry) -> StageType:
         return inspect_stage(cls)
     except Refused as refusal:
         raise Refused(f"{place}: {refusal}") from None
-
-
-def load_class(reference: str, place: str) -> Any:
-    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one."""
-    module_name, _, class_name = reference.partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not (module_name == error.name or module_name.startswith(f"{error.name}.")):
-            raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
-        raise Refused(
-            f"{place}: no module {module_name!r}{suggest(module_name, _modules_beside(module_name))}"
-        ) from None
-    except ImportError as error:
-        raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
-    if not hasattr(module, class_name):
-        raise Refused(
-            f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, _classes_of(module_name))}"
-        )
-    return getattr(module, class_name)
-
-
-def _modules_beside(module_name: str) -> list[str]:
-    """Names of the modules in the package that the missing one would be in."""
-    package = module_name.rpartition(".")[0]
-    try:
-        paths = importlib.import_module(package).__path__ if package else []
-    except (ImportError, AttributeError):
-        return []
-    return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
-
-
-def _classes_of(module_name: str) -> list[str]:
-    members = vars(sys.modules[module_name]).items()
-    return [name for name, value in members if isinstance(value, type) and value.__module__ == module_name]
 
 
 # ---------------------------------------------------------------------------------------------- settings
