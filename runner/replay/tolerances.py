@@ -26,9 +26,9 @@ class Origin:
         self.computing = list(_changes({name: then.get(name, UNKNOWN) for name in names}, packages))
         self.computing += [change for change in _changes(before, here) if not change.startswith("system ")]
         others = {name: version for name, version in then.items() if name not in names}
-        source = {"source": recording.run.get("revision", "") or "unknown"}
+        source = {"source": recording.run.get("revision") or "unknown"}
         runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
-        now = {"source": revision(recording.graph), "runner": runner_version()}
+        now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
         self.other = [*_changes(others, packages), *_changes({**source, **runner}, now)]
 
     def lines(self) -> Iterator[str]:
