@@ -21,6 +21,14 @@ def load_class(reference: str, place: str) -> Any:
     return members[class_name]
 
 
+def modules_of(graph: Mapping[str, Any]) -> list[str]:
+    """The modules of the stages of a graph that may not have been checked, each once."""
+    stages = graph.get("stages")
+    entries = cast("dict[str, Any]", stages).values() if isinstance(stages, dict) else ()
+    references = (cast("dict[str, Any]", entry).get("stage") for entry in entries if isinstance(entry, dict))
+    return list(dict.fromkeys(str(reference).partition(":")[0] for reference in references))
+
+
 def load_tolerances(reference: str | None, place: str) -> Tolerances:
     """The table ``module:NAME`` of tolerances, empty for None; raises Refused where it is none."""
     return _table(reference, place, Tolerance, key=lambda key: isinstance(key, str), keys="Type.field")

@@ -13,7 +13,7 @@ from typing import Any, cast
 import msgspec
 
 from runner.contract import Fields, Migration, Migrations
-from runner.graph.references import load_migrations
+from runner.graph.references import load_migrations, modules_of
 from runner.message.codec import Envelope
 
 UNNAMED = "MIGRATIONS"
@@ -28,8 +28,8 @@ def migrations_of(graph: Mapping[str, Any]) -> Migrations:
     """
     if (reference := graph.get("migrations")) is not None:
         return load_migrations(reference, f"migrations of graph {graph.get('name')!r}")
-    modules = (sys.modules.get(stage["stage"].partition(":")[0]) for stage in graph["stages"].values())
-    return ChainMap(*(vars(module).get(UNNAMED, {}) for module in modules if module is not None))
+    modules = (sys.modules[name] for name in modules_of(graph) if name in sys.modules)
+    return ChainMap(*(vars(module).get(UNNAMED, {}) for module in modules))
 
 
 def migrated(sealed: Envelope, migrations: Migrations) -> Envelope:

@@ -4,7 +4,6 @@ import hashlib
 import importlib.util
 import itertools
 import platform
-import re
 import subprocess
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,6 +14,8 @@ from typing import Any, cast
 
 import numpy as np
 import yaml
+
+from runner.graph.references import modules_of
 
 DISTRIBUTION = "scene-programming"
 """The package that the runner comes in."""
@@ -68,16 +69,9 @@ def revision(graph: Mapping[str, Any]) -> str:
 
     Empty outside a checkout, and several where the stages come from several. What is installed has a version instead.
     """
-    packages = dict.fromkeys(re.split(r"[.:]", str(stage.get("stage")))[0] for stage in _stages(graph))
+    packages = dict.fromkeys(module.partition(".")[0] for module in modules_of(graph))
     folders = (_folder_of(package) for package in packages)
     return " ".join(dict.fromkeys(filter(None, (_revision(folder) for folder in folders if folder is not None))))
-
-
-def _stages(graph: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Those of a graph that may not have been checked."""
-    stages = graph.get("stages")
-    entries = list(cast("dict[str, Any]", stages).values()) if isinstance(stages, dict) else []
-    return [cast("dict[str, Any]", entry) for entry in entries if isinstance(entry, dict)]
 
 
 def _folder_of(package: str) -> Path | None:
