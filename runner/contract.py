@@ -23,10 +23,10 @@ other stage and substitutes what devices emitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -112,6 +112,31 @@ class Tolerance:
 
 Tolerances = Mapping[str, Tolerance]
 """By ``Type.field`` of the message or struct that declares a field; a graph names its table: ``tolerances:``."""
+
+
+Fields = dict[str, Any]
+"""A recorded message as msgpack maps: structs are maps too, arrays ``[dtype, shape, bytes]``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Migration:
+    """From one version of a message to the next, for recordings that are older than its class.
+
+    Fields that a message gains need none: they have defaults. Where a field is renamed, retired or computed otherwise,
+    the ``version`` of its message rises by one.
+    """
+
+    renamed: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Old names of fields and their new ones; the fields of a struct inside as ``place.name``, also in lists."""
+    retired: tuple[str, ...] = ()
+    """Fields that are gone."""
+    change: Callable[[Fields], Fields] | None = None
+    """Anything else; gets the fields after they were renamed."""
+
+
+Migrations = Mapping[tuple[str, int], Migration]
+"""By the class name of a message and the version that the entry leads away from; a graph names its table:
+``migrations:``."""
 
 
 class Refused(Exception):

@@ -1,17 +1,12 @@
 """A graph of stages, checked: every key, setting, class and edge, before anything starts."""
 
-import importlib
 import json
 import math
 import os
-import pkgutil
 import re
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.metadata import metadata, packages_distributions
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -23,6 +18,7 @@ from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.packaged import locate
 from runner.graph.placement import ALONE, Layout, read_layout, read_listen, read_placement
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
+from runner.graph.references import load_class, load_migrations, load_tolerances
 
 T = TypeVar("T")
 K = TypeVar("K")
@@ -35,6 +31,10 @@ FINISHED = port_name(Finished)
 RESTARTS = 3
 """Restarts of one process before the graph ends. None for devices: what they drive has moved on meanwhile."""
 QUEUE = 64
+GRAPH_KEYS = ("name", "seed", "view", "listen", "score", "tolerances", "migrations", "numerical")
+"""Of a graph, beside its stages and hosts."""
+NUMERICAL = ("numpy",)
+"""The packages that compute where a graph names none."""
 
 
 class EdgeEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -99,6 +99,12 @@ class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerances: Annotated[
         str | None, Meta(description="module:NAME of the table of how far fields may be off on another machine")
     ] = None
+    migrations: Annotated[
+        str | None, Meta(description="module:NAME of the table of what has become of messages since they were recorded")
+    ] = None
+    numerical: Annotated[
+        tuple[str, ...], Meta(description="Packages that compute: another version may round a float differently")
+    ] = NUMERICAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,8 +213,11 @@ class Graph:
     seed: int
     view: str | None
     nodes: dict[str, Node]
+    """By name."""
     score: str | None = None
     tolerances: str | None = None
+    migrations: str | None = None
+    numerical: tuple[str, ...] = NUMERICAL
     layout: Layout = ALONE
     listen: str | None = None
     """Where everybody may listen who can call there."""
@@ -278,13 +287,16 @@ def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
     document = read_document(path)
     for assignment in assignments:
         document.set(assignment)
-    return _build(document)
+    graph = _build(document)
+    load_tolerances(graph.tolerances, document.place("tolerances"))
+    load_migrations(graph.migrations, document.place("migrations"))
+    return graph
 
 
 def graph_to_json(graph: Graph) -> str:
     """The graph as it runs, every setting written out: what processes are given and recordings keep."""
     stages = {node.name: node_entry(node) for node in graph.nodes.values()}
-    keys = {key: getattr(graph, key) for key in ("name", "seed", "view", "listen", "score", "tolerances")}
+    keys = {key: getattr(graph, key) for key in GRAPH_KEYS}
     return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
 
 
@@ -319,7 +331,7 @@ def node_from_entry(name: str, entry: dict[str, Any]) -> Node:
 
 def graph_from_json(text: str, label: str = "graph") -> Graph:
     """Reads back what :func:`graph_to_json` wrote, for this machine alone; ``label`` names it in errors."""
-    values = {key: value for key, value in json.loads(text).items() if key not in ("hosts", "keys", "router")}
+    values = {key: value for key, value in json.loads(text).items() if key not in ("hosts", "keys", "router", "listen")}
     if isinstance(values.get("stages"), dict):
         values["stages"] = {name: _unplaced(entry) for name, entry in values["stages"].items()}
     return _build(Document(label, Path.cwd(), values))
@@ -342,8 +354,8 @@ def _build(document: Document) -> Graph:
     _resolve_settings(document, entries, types)
     nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
     layout = read_layout(document)
-    listen = read_listen(document, layout)
-    checked = Graph(graph.name, graph.seed, graph.view, nodes, graph.score, graph.tolerances, layout, listen)
+    read_listen(document, layout)
+    checked = Graph(**{key: getattr(graph, key) for key in GRAPH_KEYS}, nodes=nodes, layout=layout)
     _collect(
         lambda keys: _check_edge(document, checked, *keys),
         [(node, port) for node in names for port in nodes[node].inputs],
@@ -439,50 +451,6 @@ def _load(document: Document, name: str, entry: StageEntry) -> StageType:
         return inspect_stage(cls)
     except Refused as refusal:
         raise Refused(f"{place}: {refusal}") from None
-
-
-def load_class(reference: str, place: str) -> Any:
-    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one."""
-    module_name, _, class_name = reference.partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not (module_name == error.name or module_name.startswith(f"{error.name}.")):
-            raise Refused(f"{place}: {module_name} cannot be imported: {error}{_extra(module_name)}") from None
-        raise Refused(
-            f"{place}: no module {module_name!r}{suggest(module_name, _modules_beside(module_name))}"
-        ) from None
-    except ImportError as error:
-        raise Refused(f"{place}: {module_name} cannot be imported: {error}") from None
-    if not hasattr(module, class_name):
-        raise Refused(
-            f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, _classes_of(module_name))}"
-        )
-    return getattr(module, class_name)
-
-
-@cache
-def _extra(module_name: str) -> str:
-    """What to type where a package may be there without its extra of the same name."""
-    package = module_name.partition(".")[0]
-    owners = packages_distributions().get(package, ())
-    found = [owner for owner in owners if package in (metadata(owner).get_all("Provides-Extra") or ())]
-    return f"; type: pip install '{found[0]}[{package}]'" if found else ""
-
-
-def _modules_beside(module_name: str) -> list[str]:
-    """Names of the modules in the package that the missing one would be in."""
-    package = module_name.rpartition(".")[0]
-    try:
-        paths = importlib.import_module(package).__path__ if package else []
-    except (ImportError, AttributeError):
-        return []
-    return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
-
-
-def _classes_of(module_name: str) -> list[str]:
-    members = vars(sys.modules[module_name]).items()
-    return [name for name, value in members if isinstance(value, type) and value.__module__ == module_name]
 
 
 # ---------------------------------------------------------------------------------------------- settings

@@ -32,11 +32,11 @@ from runner.hosts.head import (
     as_written,
     control,
     network_of,
+    source_of,
     this_machine,
 )
 from runner.message.packet import Packet, Process
 from runner.process.children import Family, behind, last_lines, signal_group, spawn
-from runner.recording.provenance import revision
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import private
@@ -110,8 +110,8 @@ class Agent:
             graph=as_written(self._document),
             folder=str(self._document.folder),
             cwd=str(Path.cwd()),
-            fingerprint=this_machine(),
-            revision=revision(),
+            fingerprint=this_machine(self._document),
+            source=source_of(self._document),
         )
         answer = bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS)
         welcome = msgspec.json.decode(answer, type=Welcome)

@@ -26,12 +26,20 @@ import msgspec
 
 from runner.contract import Level, Refused
 from runner.graph.document import Document, read_document, suggest
+from runner.graph.graph import NUMERICAL
 from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
 from runner.hosts.keys import credentials
 from runner.message.packet import Packet, Process
 from runner.process.stage_process import Assignment
-from runner.recording.provenance import fingerprint, machine, package_versions, revision, with_texts
+from runner.recording.provenance import (
+    fingerprint,
+    machine,
+    package_versions,
+    revision,
+    runner_version,
+    with_texts,
+)
 from runner.transport.bus import Bus
 from runner.transport.session import Router, private
 
@@ -60,7 +68,8 @@ class Hello(msgspec.Struct, frozen=True):
     """Where that file lies."""
     cwd: str
     fingerprint: str
-    revision: str
+    source: str
+    """Of the runner and of the stages."""
 
 
 class Welcome(msgspec.Struct, frozen=True):
@@ -345,9 +354,9 @@ class Hosts:
 
     def _compare_machines(self, hello: Hello) -> None:
         """Says where results may depend on which host computed them."""
-        if hello.revision != (own := revision()):
-            self._say(f"host {hello.host} runs source {hello.revision[:12]}, the head {own[:12]}", "warning")
-        if hello.fingerprint != this_machine():
+        if hello.source != (own := source_of(self._document)):
+            self._say(f"host {hello.host} has {hello.source}, the head {own}", "warning")
+        if hello.fingerprint != this_machine(self._document):
             self._say(
                 f"host {hello.host} has another processor or other libraries: floats may differ in their last bits",
                 "warning",
@@ -357,9 +366,16 @@ class Hosts:
         return not self._present
 
 
-def this_machine() -> str:
+def this_machine(document: Document) -> str:
     """Hash over what floats depend on here."""
-    return fingerprint(machine(), package_versions())
+    named = document.values.get("numerical")
+    names = map(str, cast("list[Any]", named)) if isinstance(named, list) else NUMERICAL
+    return fingerprint(machine(), package_versions(), names)
+
+
+def source_of(document: Document) -> str:
+    """What of the runner and of a graph's stages is here, in words."""
+    return f"runner {runner_version()}, stages {revision(document.values) or 'of unknown revision'}"
 
 
 def as_written(document: Document) -> str:

@@ -30,7 +30,7 @@ class Causes:
         if step is not None:
             return list(step.consumed)
         recorded = id in self._recording.messages
-        return [("", cause) for cause in self._recording.envelope(id).causes] if recorded else []
+        return [("", cause) for cause in self._recording.recorded(id).causes] if recorded else []
 
     def last_input(self, id: str) -> str | None:
         """What the step that emitted a message had waited for: the input that was recorded last."""

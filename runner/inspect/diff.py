@@ -40,7 +40,7 @@ def _found(first: Recording, second: Recording, summary: Summary) -> Iterator[st
         if id not in second.messages:
             yield f"{id}: only in {first.path}"
             continue
-        changes = list(message_differences(first.envelope(id), second.envelope(id)))
+        changes = list(message_differences(first.recorded(id), second.recorded(id)))
         if summary.add(topic_of(id), id, changes):
             yield f"{id}: {_words(changes[0])}"
     yield from (f"{id}: only in {second.path}" for id in second.messages if id not in first.messages)
@@ -77,7 +77,7 @@ def _counts(first: Recording, second: Recording) -> list[str]:
 
 def _origins(first: Recording, second: Recording) -> Iterator[str]:
     """What may explain a difference."""
-    for name in ("name", "seed", "settings", "revision", "fingerprint"):
+    for name in ("name", "seed", "settings", "revision", "runner", "fingerprint"):
         pair = first.run.get(name, ""), second.run.get(name, "")
         if pair[0] != pair[1]:
             yield f"{name}: {pair[0] or 'unknown'} and {pair[1] or 'unknown'}"

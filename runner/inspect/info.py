@@ -12,7 +12,7 @@ from runner.contract import Restarted
 from runner.graph.graph import SUPERVISOR
 from runner.graph.ports import port_name
 from runner.message.codec import Step
-from runner.recording.provenance import NUMERICAL
+from runner.recording.provenance import numerical
 from runner.recording.recording import Located, Recording
 
 Cells = Sequence[str]
@@ -35,6 +35,8 @@ def _origin(recording: Recording) -> Iterator[str]:
     size = byte_count(recording.path.stat().st_size)
     yield f"size      {size}, {len(recording.messages)} messages, {_restarts(recording)}"
     yield f"revision  {run.get('revision') or 'unknown'}"
+    if "runner" in run:
+        yield f"runner    {run['runner']}"
     yield f"machine   {machine.get('processor')}, Python {machine.get('python')}, {machine.get('blas')}"
     yield f"computes  fingerprint {recording.fingerprint}: {_packages(recording)}"
     for path, found in recording.aspect("files", dict[str, str]()).items():
@@ -43,8 +45,8 @@ def _origin(recording: Recording) -> Iterator[str]:
 
 def _packages(recording: Recording) -> str:
     packages = recording.aspect("packages", dict[str, str]())
-    shown = ", ".join(f"{name} {packages[name]}" for name in NUMERICAL if name in packages)
-    return f"{shown or 'no package'} of {len(packages)} packages"
+    shown = (f"{name} {packages.get(name, 'absent')}" for name in sorted(numerical(recording.graph)))
+    return f"{', '.join(shown) or 'no package'} of {len(packages)} packages"
 
 
 def _topics(recording: Recording) -> list[str]:

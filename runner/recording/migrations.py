@@ -1,56 +1,54 @@
-"""What has become of messages since they were recorded: the one place where old recordings learn new names.
+"""Brings recorded messages up to date as they are read: what has become of them, a graph's table says.
 
-Fields that a message gains need no entry: they have defaults. A field that is renamed, retired or computed otherwise
-raises the ``version`` of its message by one and gets an entry in :data:`MIGRATIONS`. Recordings keep their bytes; they
-are brought up to date as they are read.
+Recordings keep their bytes. What a table holds: :class:`runner.contract.Migration`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import sys
+from collections import ChainMap
+from collections.abc import Mapping
 from typing import Any, cast
 
 import msgspec
 
+from runner.contract import Fields, Migration, Migrations
+from runner.graph.references import load_migrations, modules_of
 from runner.message.codec import Envelope
 
-Fields = dict[str, Any]
-"""A message as msgpack maps: structs are maps too, arrays ``[dtype, shape, bytes]``."""
+UNNAMED = "MIGRATIONS"
+"""The tables of a graph that names none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Migration:
-    """From one version of a message to the next."""
+def migrations_of(graph: Mapping[str, Any]) -> Migrations:
+    """The table that a recorded graph names; raises Refused where it is none.
 
-    renamed: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Old names of fields and their new ones; the fields of a struct inside as ``place.name``, also in lists."""
-    retired: tuple[str, ...] = ()
-    """Fields that are gone."""
-    change: Callable[[Fields], Fields] | None = None
-    """Anything else; gets the fields after they were renamed."""
-
-    def apply(self, fields: Fields) -> Fields:
-        """The fields of the next version, in their old order."""
-        for path, name in self.renamed.items():
-            fields = _edited(fields, path.split("."), name)
-        for path in self.retired:
-            fields = _edited(fields, path.split("."), None)
-        return self.change(fields) if self.change else fields
+    Of a graph that names none, as all do that were recorded before graphs could, the tables called ``MIGRATIONS`` in
+    the modules of its stages count, as far as those are imported: who reads messages as their classes has done so.
+    """
+    if (reference := graph.get("migrations")) is not None:
+        return load_migrations(reference, f"migrations of graph {graph.get('name')!r}")
+    modules = (sys.modules[name] for name in modules_of(graph) if name in sys.modules)
+    return ChainMap(*(vars(module).get(UNNAMED, {}) for module in modules))
 
 
-MIGRATIONS: dict[tuple[str, int], Migration] = {}
-"""By the class name of a message and the version that the entry leads away from."""
-
-
-def migrated(sealed: Envelope) -> Envelope:
+def migrated(sealed: Envelope, migrations: Migrations) -> Envelope:
     """A recorded message as its class is today; itself where nothing has become of it."""
-    if (sealed.type, sealed.version) not in MIGRATIONS:
+    if (sealed.type, sealed.version) not in migrations:
         return sealed
     fields, version = cast("Fields", msgspec.msgpack.decode(sealed.body)), sealed.version
-    while (migration := MIGRATIONS.get((sealed.type, version))) is not None:
-        fields, version = migration.apply(fields), version + 1
+    while (migration := migrations.get((sealed.type, version))) is not None:
+        fields, version = _next(fields, migration), version + 1
     return msgspec.structs.replace(sealed, version=version, body=msgspec.Raw(msgspec.msgpack.encode(fields)))
+
+
+def _next(fields: Fields, migration: Migration) -> Fields:
+    """The fields of the next version, in their old order."""
+    for path, name in migration.renamed.items():
+        fields = _edited(fields, path.split("."), name)
+    for path in migration.retired:
+        fields = _edited(fields, path.split("."), None)
+    return migration.change(fields) if migration.change else fields
 
 
 def without_gained_fields(recorded: Envelope, replayed: Envelope) -> Envelope:

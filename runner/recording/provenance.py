@@ -1,12 +1,15 @@
 """Where and with what a graph ran: package versions, source revision, machine, and the files its settings name."""
 
 import hashlib
+import importlib.util
 import itertools
 import os
 import platform
 import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.metadata import distributions
+import sysconfig
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,9 +17,21 @@ import numpy as np
 import yaml
 
 from runner.graph.packaged import locate, portable_name
+from runner.graph.references import modules_of
 
-NUMERICAL = ("llvmlite", "mujoco", "numba", "numpy", "opencv-contrib-python-headless", "pyrender", "scipy", "torch")
-"""Packages that compute: another version may round a float differently."""
+DISTRIBUTION = "scene-programming"
+"""The package that the runner comes in."""
+FIRST_NUMERICAL = (
+    "llvmlite",
+    "mujoco",
+    "numba",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "pyrender",
+    "scipy",
+    "torch",
+)
+"""The packages that compute, of every recording that was made before graphs named theirs."""
 HASHED_BYTES = 64 * 2**20
 """Larger files and folders are named without a hash."""
 HASHED_FILES = 1000
@@ -34,14 +49,52 @@ def changed_packages(then: Mapping[str, str], now: Mapping[str, str]) -> Iterato
             yield f"{name} {then.get(name, 'absent')} -> {now.get(name, 'absent')}"
 
 
-def revision() -> str:
-    """The git commit of this source, with ``-dirty`` where it was changed since; empty outside a checkout."""
-    commit = _git("rev-parse", "HEAD")
-    return f"{commit}-dirty" if commit and _git("status", "--porcelain", "--untracked-files=no") else commit
+def numerical(graph: Mapping[str, Any]) -> Sequence[str]:
+    """The packages that compute, as a recorded graph names them: another version may round a float differently.
+
+    A graph without a word of them was recorded before graphs could name them.
+    """
+    return graph.get("numerical", FIRST_NUMERICAL)
 
 
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+def runner_version() -> str:
+    """The runner's version, with the revision of its source where that is a checkout."""
+    try:
+        number = version(DISTRIBUTION)
+    except PackageNotFoundError:
+        number = "not installed"
+    return f"{number} {_revision(Path(__file__).parent)}".rstrip()
+
+
+def revision(graph: Mapping[str, Any]) -> str:
+    """The git commit of the source of a graph's stages, with ``-dirty`` where it was changed since.
+
+    Empty outside a checkout, and several where the stages come from several. What is installed has a version instead.
+    """
+    packages = dict.fromkeys(module.partition(".")[0] for module in modules_of(graph))
+    folders = (_folder_of(package) for package in packages)
+    return " ".join(dict.fromkeys(filter(None, (_revision(folder) for folder in folders if folder is not None))))
+
+
+def _folder_of(package: str) -> Path | None:
+    """Where a package or module at the top lies, without importing it."""
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return None
+    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    return next((Path(place).parent for place in places if place and Path(place).exists()), None)
+
+
+@cache
+def _revision(folder: Path) -> str:
+    installed = any(folder.is_relative_to(sysconfig.get_path(name)) for name in ("purelib", "platlib"))
+    commit = "" if installed else _git(folder, "rev-parse", "HEAD")
+    return f"{commit}-dirty" if commit and _git(folder, "status", "--porcelain", "--untracked-files=no") else commit
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(folder), *arguments]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
@@ -61,11 +114,11 @@ def machine() -> dict[str, str]:
     }
 
 
-def fingerprint(machine: Mapping[str, str], packages: Mapping[str, str]) -> str:
+def fingerprint(machine: Mapping[str, str], packages: Mapping[str, str], numerical: Iterable[str]) -> str:
     """One hash over all that equal bytes need: the processor and its vector units, libm, the interpreter, BLAS and the
     packages that compute. Where it differs from the recording's, floats are equal within tolerances only."""
     parts = [machine.get(key, "") for key in ("processor", "vectors", "libc", "python", "blas")]
-    parts += [f"{name} {packages.get(name, 'absent')}" for name in NUMERICAL]
+    parts += [f"{name} {packages.get(name, 'absent')}" for name in sorted(numerical)]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 

@@ -17,8 +17,8 @@ from mcap.records import Channel, Metadata, Schema
 from runner.contract import Refused
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
 from runner.recording.container import Container, Damage, Entry, open_file
-from runner.recording.migrations import migrated
-from runner.recording.provenance import fingerprint
+from runner.recording.migrations import migrated, migrations_of
+from runner.recording.provenance import fingerprint, numerical
 
 T = TypeVar("T")
 PROFILE = "scene-programming"
@@ -189,7 +189,8 @@ class Recording:
     @property
     def fingerprint(self) -> str:
         """Hash of the processor and the libraries it was computed with, see :mod:`runner.recording.provenance`."""
-        return fingerprint(self.aspect("machine", dict[str, str]()), self.aspect("packages", dict[str, str]()))
+        packages = self.aspect("packages", dict[str, str]())
+        return fingerprint(self.aspect("machine", dict[str, str]()), packages, numerical(self.graph))
 
     @property
     def graph(self) -> dict[str, Any]:
@@ -243,7 +244,13 @@ class Recording:
             yield from (record for record in container if isinstance(record, Metadata) or _readable(record))
 
     def envelope(self, id: str) -> Envelope:
-        """One message by id, as its class is today; raises KeyError where it is not recorded."""
+        """One message by id, as its class is today; raises KeyError where it is not recorded and Refused where the
+        migrations that the graph names are not there.
+        """
+        return migrated(self.recorded(id), migrations_of(self.graph))
+
+    def recorded(self, id: str) -> Envelope:
+        """One message by id, as it was when it was recorded; raises KeyError where it is not."""
         offset = self.messages[id].offset
         if offset not in self._open:
             self._open[offset] = self._envelopes_at(offset)
@@ -290,7 +297,7 @@ class Recording:
         for entry in entries:
             if not entry.topic.startswith((JOURNAL, LOG, "lost/")):
                 with contextlib.suppress(CodecError):  # noted as damage when the file was read
-                    sealed = migrated(unpack(Envelope, entry.data))
+                    sealed = unpack(Envelope, entry.data)
                     envelopes.setdefault(sealed.id, sealed)
         return envelopes
 

@@ -21,7 +21,16 @@ from runner.graph.graph import Destination
 from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.recording.container import hold
-from runner.recording.provenance import file_hashes, fingerprint, machine, package_versions, portable, revision
+from runner.recording.provenance import (
+    file_hashes,
+    fingerprint,
+    machine,
+    numerical,
+    package_versions,
+    portable,
+    revision,
+    runner_version,
+)
 from runner.recording.recording import (
     JOURNAL,
     LOG,
@@ -96,10 +105,11 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
         "settings": json.dumps(manifest.settings),
         "records": STEPS_ONLY if manifest.steps_only else "messages and steps",
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "revision": revision(),
+        "revision": revision(graph),
+        "runner": runner_version(),
         "packages": json.dumps(packages),
         "machine": json.dumps(here),
-        "fingerprint": fingerprint(here, packages),
+        "fingerprint": fingerprint(here, packages, numerical(graph)),
         "files": json.dumps(file_hashes(graph)),
     }
 

@@ -20,11 +20,12 @@ import msgspec
 from runner.contract import Refused, Tolerance, Tolerances
 from runner.graph.document import Document
 from runner.graph.graph import Graph, Node, graph_from_json, graph_to_json, node_from_entry
+from runner.graph.references import load_tolerances
 from runner.inspect.info import seconds, table
 from runner.inspect.summary import Summary
 from runner.recording.recording import Recording, replicated
 from runner.replay.tasks import Comparison, Reenactment, Result, Task, steps_of
-from runner.replay.tolerances import Origin, load_tolerances
+from runner.replay.tolerances import Origin
 from runner.replay.workshop import Job, run_each
 
 Say = Callable[[str], None]
@@ -80,9 +81,13 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: 
     values, tolerances = recording.graph, dict[str, Tolerance]()
     if assignments or not origin.same:  # else it was checked when it was recorded: classes are imported as they come
         graph = graph_from_json(changed_graph(recording, assignments), str(path))
-        values, tolerances = json.loads(graph_to_json(graph)), {} if origin.same else load_tolerances(graph)
+        values, tolerances = json.loads(graph_to_json(graph)), {} if origin.same else _tolerances(graph)
     verification = _Verification(recording, values, tolerances, say)
     return verification.conclude(verification.run(workers or len(os.sched_getaffinity(0))), began)
+
+
+def _tolerances(graph: Graph) -> Tolerances:
+    return load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
 
 
 class _Verification:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, cast
 
-from runner.contract import Refused, Tolerance, Tolerances
-from runner.graph.graph import Graph, load_class
+from runner.contract import Tolerance, Tolerances
 from runner.inspect.compare import Difference
-from runner.recording.provenance import NUMERICAL, fingerprint, machine, package_versions, revision
+from runner.recording.provenance import fingerprint, machine, numerical, package_versions, revision, runner_version
 from runner.recording.recording import Recording
 
 UNKNOWN = "absent"
@@ -19,17 +17,19 @@ class Origin:
     """What has changed between the recording and here."""
 
     def __init__(self, recording: Recording) -> None:
-        packages, here = package_versions(), machine()
+        packages, here, names = package_versions(), machine(), numerical(recording.graph)
         then = recording.aspect("packages", dict[str, str]())
         # An aspect that an older runner did not record cannot be said to have changed.
         before = {**here, **recording.aspect("machine", dict[str, str]())}
-        self.same = fingerprint(before, then) == fingerprint(here, packages)
+        self.same = fingerprint(before, then, names) == fingerprint(here, packages, names)
         """True where floats must come out equal to the last bit."""
-        self.computing = list(_changes({name: then.get(name, UNKNOWN) for name in NUMERICAL}, packages))
+        self.computing = list(_changes({name: then.get(name, UNKNOWN) for name in names}, packages))
         self.computing += [change for change in _changes(before, here) if not change.startswith("system ")]
-        others = {name: version for name, version in then.items() if name not in NUMERICAL}
-        source = {"source": recording.run.get("revision", "") or "unknown"}
-        self.other = [*_changes(others, packages), *_changes(source, {"source": revision()})]
+        others = {name: version for name, version in then.items() if name not in names}
+        source = {"source": recording.run.get("revision") or "unknown"}
+        runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
+        now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
+        self.other = [*_changes(others, packages), *_changes({**source, **runner}, now)]
 
     def lines(self) -> Iterator[str]:
         """For people, what matters most first; nothing where nothing has changed."""
@@ -43,21 +43,6 @@ def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
     for name, value in then.items():
         if now.get(name, UNKNOWN) != value:
             yield f"{name} {value} -> {now.get(name, UNKNOWN)}"
-
-
-def load_tolerances(graph: Graph) -> Tolerances:
-    """The table that a graph names; empty where it names none. Raises Refused where it is no such table."""
-    if graph.tolerances is None:
-        return {}
-    place = f"tolerances of graph {graph.name!r}"
-    table = load_class(graph.tolerances, place)
-    if not isinstance(table, Mapping):
-        raise Refused(f"{place}: {graph.tolerances} is a {type(table).__name__}; valid: a mapping of Type.field")
-    entries = cast("Mapping[Any, Any]", table)
-    wrong = next((key for key, value in entries.items() if not isinstance(value, Tolerance)), None)
-    if wrong is not None:
-        raise Refused(f"{place}: {wrong} is {entries[wrong]!r}; valid: a runner.contract.Tolerance")
-    return entries
 
 
 def outside(differences: Iterable[Difference], tolerances: Tolerances) -> Iterator[Difference]:

@@ -13,7 +13,8 @@ from typing import Any, cast
 
 from runner.contract import Message, Refused, Scorer
 from runner.graph.document import Document, suggest
-from runner.graph.graph import Graph, graph_from_json, load_class, node_entry
+from runner.graph.graph import Graph, graph_from_json, node_entry
+from runner.graph.references import load_class
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import CodecError, Envelope, open_envelope, pack

@@ -13,10 +13,9 @@ from pathlib import Path
 import pytest
 
 from runner.transport.session import new_endpoint
-from tests.runner.test_runs import Run
+from tests.runner.test_runs import Run, finish, run
 
 HOSTS = Path(__file__).with_name("hosts.yaml")
-PATIENCE_SECONDS = 150
 NAMES = ("head", "worker1", "worker2")
 
 
@@ -128,12 +127,7 @@ class Party:
 
     def end(self, host: str, before: str = "") -> Run:
         """Waits until a host has ended."""
-        process = self.hosts.pop(host)
-        try:
-            output, _ = process.communicate(timeout=PATIENCE_SECONDS)
-        finally:
-            process.kill()
-        return Run(process.returncode, before + output, self.folder / host)
+        return finish(self.hosts.pop(host), self.folder / host, before)
 
     def close(self) -> None:
         for process in self.hosts.values():
@@ -143,7 +137,4 @@ class Party:
 
 def run_here(folder: Path) -> Run:
     """The same graph, undisturbed, on one machine."""
-    command = [sys.executable, "-m", "runner.cli", "up", str(HOSTS), "--here", "--recordings", str(folder)]
-    command += ["--set", f"sink.path={folder / 'out.txt'}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False)
-    return Run(done.returncode, done.stdout + done.stderr, folder)
+    return run(HOSTS, folder, flags=("--here",))

@@ -1,19 +1,17 @@
 """Makes recordings of the toy graph without processes: the same steps, journal and writer as in a run."""
 
-import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.graph.graph import Graph, Node, graph_to_json, load_graph
+from runner.graph.graph import Graph, graph_to_json, load_graph
 from runner.message.codec import Envelope, LogLine, Step, pack
-from runner.process.inbox import Inbox, Ready
-from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import RUN, Verdict
 from runner.recording.writer import Manifest, RecordingWriter, topic
+from runner.testing import Bench, Done
 
 TOYS = Path(__file__).with_name("toys.yaml")
 Keep = Callable[[Envelope | Step], Envelope | Step | None]
@@ -45,42 +43,30 @@ def record_toys(
 
 def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
     """Steps every stage until nothing is left to do."""
-    executors = {
-        node.name: Executor(node, node.construct(), seed=graph.seed, directory=folder, log=lambda *_: None)
+    benches = {
+        node.name: Bench(node, node.construct(), seed=graph.seed, directory=folder, log=lambda *_: None)
         for node in graph.nodes.values()
     }
-    inboxes = {node.name: Inbox(node) for node in graph.nodes.values()}
-    numbers = dict.fromkeys(graph.nodes, 0)
+    numbers = Counter[str]()
     sent: deque[Envelope] = deque()
 
-    def journalled(node: Node, handler: str, consumed: tuple[tuple[str, str], ...], out: list[Envelope]) -> Step:
-        ids = tuple(sealed.id for sealed in out)
-        numbers[node.name] += 1
-        return Step(
-            node.name, 0, 0, numbers[node.name] - 1, handler, consumed, ids, out[0].time_ns if out else 0, 0, 0, 1000
-        )
+    def records(stage: str, steps: Iterable[Done]) -> Iterator[Envelope | Step]:
+        for done in steps:
+            sent.extend(done.emitted)
+            yield from done.emitted
+            consumed = tuple((arrival.port.name, arrival.envelope.id) for arrival in done.ready.arrivals)
+            emitted = tuple(sealed.id for sealed in done.emitted)
+            time_ns = done.emitted[0].time_ns if done.emitted else 0
+            yield Step(stage, 0, 0, numbers[stage], done.ready.handler.name, consumed, emitted, time_ns, 0, 0, 1000)
+            numbers[stage] += 1
 
-    def step(node: Node, ready: Ready) -> Iterator[Envelope | Step]:
-        time_ns = step_time(node, ready.arrivals, time.time_ns())
-        out = list(executors[node.name].run(ready.handler, ready.arrivals, time_ns))
-        sent.extend(out)
-        consumed = tuple((arrival.port.name, arrival.envelope.id) for arrival in ready.arrivals)
-        yield from [*out, journalled(node, ready.handler.name, consumed, out)]
-
-    for node in graph.nodes.values():
-        if node.type.source is not None:
-            for draft in executors[node.name].advance(node.type.source, time.time_ns):
-                sealed = draft.sealed()
-                sent.append(sealed)
-                yield from [sealed, journalled(node, "source", (), [sealed])]
+    for stage, bench in benches.items():
+        yield from records(stage, bench.advance())
     while sent:
         sealed = sent.popleft()
         stage, _, port = sealed.id.partition("#")[0].partition(".")
         for route in (route for route in graph.routes(stage) if route.output == port):
-            node = graph.nodes[route.consumer]
-            inboxes[node.name].add(receive(node.type.inputs[route.input], sealed))
-            while ready := inboxes[node.name].pop():
-                yield from step(node, ready)
+            yield from records(route.consumer, benches[route.consumer].take(route.input, sealed))
 
 
 def rewrite(

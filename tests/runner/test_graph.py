@@ -69,6 +69,15 @@ def test_a_good_graph_loads(tmp_path: Path):
         ("{total: gatherer.total}", "{}", r":22: stages.sink.inputs: not connected: total \(Total\)"),
         ("queue: 8", "queue: 0", ":14: stages.worker.inputs.number.queue: Expected `int` >= 1"),
         ("queue: 8", "policy: newest", ":14: stages.worker.inputs.number.policy: .*'newest'; valid: block, latest"),
+        (
+            "seed: 7",
+            "migrations: tests.runner.weather:MIGRATION",
+            ":2: migrations: no table 'MIGRATION' in .*; did you",
+        ),
+        ("seed: 7", "migrations: tests.runner.toys:TOLERANCES", ":2: migrations: 'Answer.samples' is no key of such a"),
+        ("seed: 7", "tolerances: tests.runner.weather:MIGRATIONS", ":2: tolerances: .*; valid: Type.field"),
+        ("seed: 7", "tolerances: tests.runnr.toys:TABLE", ":2: tolerances: no module 'tests.runnr.toys'"),
+        ("seed: 7", "numerical: numpy", ":2: numerical: Expected `array`, got `str`"),
         ("  watcher:", "  supervisor:", ":23: stages.supervisor: a stage's name is .* none of supervisor"),
     ],
 )
@@ -151,7 +160,7 @@ def test_mermaid_shows_stages_and_types(tmp_path: Path):
 
 
 def test_the_published_schema_is_the_one_in_force():
-    assert json.loads((ROOT / "runner" / "graph.schema.json").read_text()) == graph_schema()
+    assert json.loads((ROOT / "runner" / "graph.schema.json").read_text()) == json.loads(json.dumps(graph_schema()))
 
 
 @pytest.mark.parametrize(

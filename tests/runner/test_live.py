@@ -29,9 +29,10 @@ from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, u
 from runner.recording.recording import Recording
 from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
 from runner.supervise.registry import Entry, Registration, find_run, runs
+from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
 from runner.transport.session import new_endpoint, runtime_folder
-from tests.runner.test_runs import HERE, TOYS, finish, processes_of, read_until
+from tests.runner.test_runs import HERE, TOYS, finish, processes_of
 from tests.runner.test_runs import Run as Finished
 from tests.runner.toys import Sum
 from tests.runner.waiting import wait_until
@@ -44,14 +45,8 @@ class Run:
 
     def __init__(self, folder: Path, graph: Path, *settings: str) -> None:
         self.folder = folder
-        changes = [part for setting in settings for part in ("--set", setting)]
-        command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder), *changes]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        try:
-            self.printed = read_until(self.process, "processes are ready")
-        except AssertionError:
-            self.process.communicate()
-            raise
+        self.process = start_graph(graph, *settings, folder=folder)
+        self.printed = read_until(self.process, "processes are ready")
         self.entry = next(entry for entry in runs() if Path(entry.recording).parent == folder)
 
     def pid_of(self, stage: str) -> int:

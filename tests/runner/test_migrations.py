@@ -1,18 +1,22 @@
 """Old recordings stay alive: a real one of the first runner, whose messages have changed since."""
 
+import json
+import re
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from runner.contract import Migration, Refused
 from runner.message.codec import CodecError, Envelope, decode_untyped, open_envelope
-from runner.recording.migrations import Migration, migrated, without_gained_fields
+from runner.recording.migrations import migrated, without_gained_fields
 from runner.recording.recording import Recording
 from runner.replay.replay import verify
 from tests.runner.recordings import rewrite
-from tests.runner.weather import Forecast, Reading
+from tests.runner.weather import MIGRATIONS, Forecast, Reading
 
 OLD = Path(__file__).with_name("weather-1.mcap")
+OTHER = {**MIGRATIONS, ("Reading", 2): Migration(change=lambda fields: {**fields, "humidity": 0.25})}
 
 
 def replay(path: Path) -> tuple[int, str]:
@@ -51,6 +55,26 @@ def test_a_version_without_a_way_to_today_is_refused():
         open_envelope(Reading, msgspec.structs.replace(sealed, version=4))
 
 
+def naming(migrations: str, folder: Path) -> Recording:
+    """The old recording as if its graph had named a table."""
+    graph = json.dumps({**Recording(OLD).graph, "migrations": migrations})
+    return Recording(rewrite(OLD, folder / "named.mcap", lambda _, data: data, {"graph": graph}))
+
+
+def test_the_table_is_the_one_that_the_recorded_graph_names(tmp_path: Path):
+    named = naming("tests.runner.test_migrations:OTHER", tmp_path)
+    reading = open_envelope(Reading, named.envelope("thermometer.reading#1"))
+    assert (reading.humidity, reading.place.station) == (0.25, "roof 1")
+
+
+def test_what_was_recorded_is_there_without_the_table_that_is_gone(tmp_path: Path):
+    named = naming("tests.runner.weathr:MIGRATIONS", tmp_path)
+    assert "celsius" in decode_untyped(named.recorded("thermometer.reading#1").body)
+    expected = "migrations of graph 'weather': no module 'tests.runner.weathr'; did you mean 'tests.runner.weather'"
+    with pytest.raises(Refused, match=re.escape(expected)):
+        named.envelope("thermometer.reading#1")
+
+
 def envelope(kind: str, version: int, **fields: object) -> Envelope:
     body = msgspec.Raw(msgspec.msgpack.encode(fields))
     return Envelope("a.b#0", "a.b#0", 0, kind, version, (), body)
@@ -61,16 +85,14 @@ def test_fields_are_renamed_retired_and_changed_in_lists_and_structs_too():
         renamed={"things.pose": "T"}, retired=("colour", "things.age"), change=lambda fields: {**fields, "count": 2}
     )
     things = [{"pose": 1, "age": 7}, {"pose": 2, "age": 8}]
-    assert migration.apply({"colour": "red", "things": things, "n": 1}) == {
-        "things": [{"T": 1}, {"T": 2}],
-        "n": 1,
-        "count": 2,
-    }
+    today = migrated(envelope("Box", 1, colour="red", things=things, n=1), {("Box", 1): migration})
+    assert today.version == 2
+    assert decode_untyped(today.body) == {"things": [{"T": 1}, {"T": 2}], "n": 1, "count": 2}
 
 
 def test_what_nothing_became_of_keeps_its_bytes():
     sealed = envelope("Something", 1, x=1)
-    assert migrated(sealed) is sealed
+    assert migrated(sealed, MIGRATIONS) is sealed
 
 
 def test_gained_fields_are_not_compared_and_lost_ones_are():

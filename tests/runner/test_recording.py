@@ -115,7 +115,8 @@ def test_says_what_ran_where(toys: Path):
     assert json.loads(run["machine"])["python"]
     assert run["fingerprint"] == Recording(toys).fingerprint
     text = describe(toys)
-    assert f"fingerprint {run['fingerprint']}: llvmlite" in text
+    assert f"runner    {run['runner']}" in text
+    assert f"fingerprint {run['fingerprint']}: numpy {np.__version__} of" in text
     assert f"numpy {np.__version__}" in text
 
 

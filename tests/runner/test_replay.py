@@ -233,8 +233,8 @@ def test_on_the_same_machine_tolerances_never_apply(toys: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("table", "error"),
     [
-        ("tests.runner.toys:TOLERANCE", "no class 'TOLERANCE' in tests.runner.toys"),
-        ("tests.runner.toys:Counter", "tests.runner.toys:Counter is a type; valid: a mapping of Type.field"),
+        ("tests.runner.toys:TOLERANCE", "no table 'TOLERANCE' in tests.runner.toys; did you mean 'TOLERANCES'?"),
+        ("tests.runner.toys:Counter", "no table 'Counter' in tests.runner.toys; valid: TOLERANCES"),
     ],
 )
 def test_a_table_that_is_none_is_refused(toys: Path, tmp_path: Path, table: str, error: str):

@@ -4,16 +4,17 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from runner import testing
 from runner.contract import Refused
 from runner.recording.recording import Recording
 from runner.replay.replay import verify
+from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
 
 HERE = Path(__file__).parent
@@ -22,18 +23,9 @@ DOUBLES = HERE / "doubles.yaml"
 ALBUM = HERE / "album.yaml"
 
 
-@dataclass
-class Run:
-    """A finished ``runner up``."""
-
-    code: int
-    output: str
-    folder: Path
-
-    @property
-    def recording(self) -> Path:
-        (path,) = self.folder.glob("*.mcap")
-        return path
+@dataclass(frozen=True)
+class Run(testing.Run):
+    """A finished ``runner up`` of a graph whose sink writes a file."""
 
     @property
     def result(self) -> list[str]:
@@ -41,31 +33,15 @@ class Run:
 
 
 def start(graph: Path, folder: Path, *settings: str, flags: tuple[str, ...] = ()) -> subprocess.Popen[str]:
-    changes = [part for setting in (f"sink.path={folder / 'out.txt'}", *settings) for part in ("--set", setting)]
-    command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder), *changes, *flags]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return start_graph(graph, f"sink.path={folder / 'out.txt'}", *settings, folder=folder, options=flags)
 
 
 def finish(process: subprocess.Popen[str], folder: Path, before: str = "") -> Run:
-    try:
-        output, _ = process.communicate(timeout=150)
-    finally:
-        process.kill()
-    return Run(process.returncode, before + output, folder)
+    return Run(**vars(testing.finish(process, folder, before=before)))
 
 
-def run(graph: Path, folder: Path, *settings: str) -> Run:
-    return finish(start(graph, folder, *settings), folder)
-
-
-def read_until(process: subprocess.Popen[str], text: str) -> str:
-    assert process.stdout is not None
-    seen = ""
-    for line in process.stdout:
-        seen += line
-        if text in line:
-            return seen
-    raise AssertionError(f"{text!r} never appeared:\n{seen}")
+def run(graph: Path, folder: Path, *settings: str, flags: tuple[str, ...] = ()) -> Run:
+    return finish(start(graph, folder, *settings, flags=flags), folder)
 
 
 def changed(source: Path, folder: Path, **changes: str) -> Path:
@@ -243,7 +219,7 @@ def test_a_slow_consumer_holds_its_publisher_back(tmp_path: Path):
 
 
 def test_a_run_that_records_steps_only_says_so_and_cannot_be_replayed(tmp_path: Path):
-    done = finish(start(DOUBLES, tmp_path, flags=("--steps-only",)), tmp_path)
+    done = run(DOUBLES, tmp_path, flags=("--steps-only",))
     recording = Recording(done.recording)
     assert done.code == 0
     assert (len(recording.messages), str(recording.verdict)) == (0, "INCOMPLETE: steps only")

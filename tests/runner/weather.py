@@ -11,14 +11,15 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.contract import Context, Finished, Message, Spec, Stage, Struct
-from runner.recording.migrations import MIGRATIONS, Migration
+from runner.contract import Context, Finished, Message, Migration, Spec, Stage, Struct
 
 Vector = Annotated[NDArray[np.float64], Spec("float64", ("N",))]
 
-MIGRATIONS["Reading", 1] = Migration(renamed={"celsius": "temperature", "place.name": "station"}, retired=("unit",))
-MIGRATIONS["Reading", 2] = Migration(change=lambda fields: {**fields, "humidity": 0.5})
-MIGRATIONS["Forecast", 1] = Migration(renamed={"place.name": "station"})
+MIGRATIONS = {
+    ("Reading", 1): Migration(renamed={"celsius": "temperature", "place.name": "station"}, retired=("unit",)),
+    ("Reading", 2): Migration(change=lambda fields: {**fields, "humidity": 0.5}),
+    ("Forecast", 1): Migration(renamed={"place.name": "station"}),
+}
 
 
 class Place(Struct, frozen=True, kw_only=True):

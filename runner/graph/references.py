@@ -1,0 +1,102 @@
+"""Finds what a graph names as ``module:NAME``: classes and tables."""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import metadata, packages_distributions
+from typing import Any, TypeVar, cast
+
+from runner.contract import Migration, Migrations, Refused, Tolerance, Tolerances
+from runner.graph.document import suggest
+
+T = TypeVar("T")
+
+
+def load_class(reference: str, place: str) -> Any:
+    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one."""
+    module_name, _, class_name = reference.partition(":")
+    members = vars(_module(module_name, place))
+    if class_name not in members:
+        classes = [name for name, value in members.items() if _is_class_of(value, module_name)]
+        raise Refused(f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, classes)}")
+    return members[class_name]
+
+
+def modules_of(graph: Mapping[str, Any]) -> list[str]:
+    """The modules of the stages of a graph that may not have been checked, each once."""
+    stages = graph.get("stages")
+    entries = cast("dict[str, Any]", stages).values() if isinstance(stages, dict) else ()
+    references = (cast("dict[str, Any]", entry).get("stage") for entry in entries if isinstance(entry, dict))
+    return list(dict.fromkeys(str(reference).partition(":")[0] for reference in references))
+
+
+def load_tolerances(reference: str | None, place: str) -> Tolerances:
+    """The table ``module:NAME`` of tolerances, empty for None; raises Refused where it is none."""
+    return _table(reference, place, Tolerance, key=lambda key: isinstance(key, str), keys="Type.field")
+
+
+def load_migrations(reference: str | None, place: str) -> Migrations:
+    """The table ``module:NAME`` of migrations, empty for None; raises Refused where it is none."""
+    return _table(reference, place, Migration, key=_is_version, keys="(type, version)")
+
+
+def _table(
+    reference: str | None, place: str, kind: type[T], *, key: Callable[[Any], bool], keys: str
+) -> Mapping[Any, T]:
+    if reference is None:
+        return {}
+    module_name, _, name = reference.partition(":")
+    members = vars(_module(module_name, place))
+    table = members.get(name)
+    if not isinstance(table, Mapping):
+        tables = [other for other, value in members.items() if isinstance(value, Mapping) and other[:1] != "_"]
+        raise Refused(f"{place}: no table {name!r} in {module_name}{suggest(name, tables)}")
+    for found, value in cast("Mapping[Any, Any]", table).items():
+        if not key(found):
+            raise Refused(f"{place}: {found!r} is no key of such a table; valid: {keys}")
+        if not isinstance(value, kind):
+            raise Refused(f"{place}: {found} is {value!r}; valid: a runner.contract.{kind.__name__}")
+    return cast("Mapping[Any, T]", table)
+
+
+def _is_version(key: Any) -> bool:
+    match key:
+        case (str(), int()):
+            return True
+        case _:
+            return False
+
+
+def _module(name: str, place: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not (name == error.name or name.startswith(f"{error.name}.")):
+            raise Refused(f"{place}: {name} cannot be imported: {error}{_extra(name)}") from None
+        raise Refused(f"{place}: no module {name!r}{suggest(name, _modules_beside(name))}") from None
+    except ImportError as error:
+        raise Refused(f"{place}: {name} cannot be imported: {error}") from None
+
+
+@cache
+def _extra(module_name: str) -> str:
+    """What to type where a package may be there without its extra of the same name."""
+    package = module_name.partition(".")[0]
+    owners = packages_distributions().get(package, ())
+    found = [owner for owner in owners if package in (metadata(owner).get_all("Provides-Extra") or ())]
+    return f"; type: pip install '{found[0]}[{package}]'" if found else ""
+
+
+def _modules_beside(module_name: str) -> list[str]:
+    """Names of the modules in the package that the missing one would be in."""
+    package = module_name.rpartition(".")[0]
+    try:
+        paths = importlib.import_module(package).__path__ if package else []
+    except (ImportError, AttributeError):
+        return []
+    return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
+
+
+def _is_class_of(value: Any, module_name: str) -> bool:
+    return isinstance(value, type) and value.__module__ == module_name

@@ -1,0 +1,260 @@
+"""Tests for who writes stages: one stage in this process, or a whole graph as ``runner up`` runs it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from runner.contract import Level, Message, Refused, Stage
+from runner.graph.document import suggest
+from runner.graph.graph import QUEUE, Edge, Node
+from runner.graph.ports import StageType, inspect_stage, port_name
+from runner.message import codec
+from runner.message.codec import Envelope, open_envelope
+from runner.process.inbox import Inbox, Ready
+from runner.process.step import Executor, Log, receive, step_time
+from runner.recording.recording import Recording, split_id, topic_of
+
+M = TypeVar("M", bound=Message)
+Given = Message | Mapping[str, Message | Sequence[Message]]
+"""What arrives with a lineage of its own: a message, for the port of its type, or all that a step takes by port, the
+parts of a gather in a list."""
+PERIOD_NS = 1_000_000_000
+PATIENCE_SECONDS = 120.0
+GRACE_SECONDS = 10.0
+"""For a graph that takes too long to end in order."""
+
+
+# ---------------------------------------------------------------------------------------------- one stage
+
+
+def run_stage(
+    stage: Stage,
+    given: Iterable[Given] = (),
+    *,
+    seed: int = 0,
+    name: str | None = None,
+    times_ns: Sequence[int] | None = None,
+    folder: Path | None = None,
+    log: Log | None = None,
+    limit: int | None = None,
+) -> list[Any]:
+    """What a stage emits, in order: at its start, for what is given, and from its source where it has one.
+
+    Steps, joins, gathers, checks of messages and contexts are those of a run. Raises what a handler raises, CodecError
+    for a message that breaks its class, and Refused for one that fits no port.
+
+    ``seed`` and ``name`` are the graph's seed and the stage's name there (by default that of its class in snake case):
+    random numbers depend on both. ``times_ns`` are logical times of what is given; without, they are a second apart.
+    ``folder`` is the context's directory; without, one that is gone afterwards. ``log`` takes what the stage says;
+    without, it is printed. ``limit`` is how many messages are wanted, of a source that never ends.
+    """
+    with contextlib.ExitStack() as stack:
+        directory = folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        bench = Bench(node_of(stage, name), stage, seed=seed, directory=directory, log=log or _show)
+        emitted = (sealed for done in _steps(bench, given, times_ns) for sealed in done.emitted)
+        outputs = bench.node.type.outputs
+        messages = [
+            open_envelope(outputs[topic_of(sealed.id).partition("/")[2]], sealed)
+            for sealed in itertools.islice(emitted, limit)
+        ]
+        bench.say_what_is_left()
+        return messages
+
+
+def node_of(stage: Stage, name: str | None = None) -> Node:
+    """A stage as a graph would have it, with its ports open."""
+    cls = type(stage)
+    kind = inspect_stage(cls)
+    edges = {port: Edge("given", port, "block", QUEUE) for port in kind.inputs}
+    return Node(name or port_name(cls), f"{cls.__module__}:{cls.__qualname__}", kind, None, edges, 1, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A step, and what it emitted."""
+
+    ready: Ready
+    emitted: list[Envelope]
+
+
+class Bench:
+    """One stage in this process between its inbox and what it emits, without bus, journal or recording."""
+
+    def __init__(self, node: Node, stage: Stage, *, seed: int, directory: Path, log: Log) -> None:
+        self.node = node
+        self._inbox = Inbox(node)
+        self._executor = Executor(node, stage, seed=seed, directory=directory, log=log)
+        self._log = log
+
+    def start(self) -> Iterator[Done]:
+        """Runs the handlers that take nothing."""
+        for handler in self.node.type.handlers:
+            if not handler.inputs:
+                yield self._step(Ready(handler, ()))
+
+    def take(self, port: str, envelope: Envelope) -> Iterator[Done]:
+        """Takes a message and runs the steps that it makes possible."""
+        self._inbox.add(receive(self.node.type.inputs[port], envelope))
+        while (ready := self._inbox.pop()) is not None:
+            yield self._step(ready)
+
+    def advance(self) -> Iterator[Done]:
+        """Runs the source, where there is one, to its end; each message is a step."""
+        if (source := self.node.type.source) is not None:
+            for draft in self._executor.advance(source, time.time_ns):
+                yield Done(Ready(source, ()), [draft.sealed()])
+
+    def say_what_is_left(self) -> None:
+        """Logs what was never worked on."""
+        for handler, lineage, lacking in self._inbox.incomplete():
+            self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
+
+    def _step(self, ready: Ready) -> Done:
+        time_ns = step_time(self.node, ready.arrivals, time.time_ns())
+        return Done(ready, list(self._executor.run(ready.handler, ready.arrivals, time_ns)))
+
+
+def _steps(bench: Bench, given: Iterable[Given], times_ns: Sequence[int] | None) -> Iterator[Done]:
+    yield from bench.start()
+    numbers = Counter[str]()
+    times = itertools.count(0, PERIOD_NS) if times_ns is None else times_ns
+    for item, (one, time_ns) in enumerate(zip(given, times, strict=times_ns is not None)):
+        for port, message in _by_port(bench.node.type, one):
+            id, lineage = f"given.{port}#{numbers[port]}", f"given.item#{item}"
+            numbers[port] += 1
+            sealed = codec.envelope(message, id=id, lineage=lineage, time_ns=time_ns, causes=())
+            yield from bench.take(port, sealed)
+    yield from bench.advance()
+
+
+def _by_port(kind: StageType, one: Given) -> Iterator[tuple[str, Message]]:
+    if isinstance(one, Message):
+        yield _only_port(kind, type(one)), one
+        return
+    for port, value in one.items():
+        if port not in kind.inputs:
+            raise Refused(f"{kind.cls.__name__} has no input {port!r}{suggest(port, kind.inputs)}")
+        for message in [value] if isinstance(value, Message) else value:
+            yield port, message
+
+
+def _only_port(kind: StageType, given: type[Message]) -> str:
+    ports = [port.name for port in kind.inputs.values() if port.type is given]
+    if len(ports) != 1:
+        inputs = ", ".join(f"{port.name} ({port.type.__name__})" for port in kind.inputs.values()) or "none"
+        fits = f"fits {' and '.join(ports)}: name one, {{'{ports[0]}': ...}}" if ports else "fits no input"
+        raise Refused(f"{kind.cls.__name__}: a {given.__name__} {fits}; inputs: {inputs}")
+    return ports[0]
+
+
+def _show(text: str, level: Level) -> None:
+    print(f"{level:<8} {text}")
+
+
+# ---------------------------------------------------------------------------------------------- a whole graph
+
+
+@dataclass(frozen=True)
+class Run:
+    """A graph that has run."""
+
+    code: int
+    """Exit status of ``runner up``: 0 as wanted, 1 failed, 2 refused, 3 recording INCOMPLETE."""
+    output: str
+    """All that it printed."""
+    folder: Path
+    """Of its recording."""
+
+    @property
+    def recording(self) -> Path:
+        """The file that was recorded."""
+        (path,) = self.folder.glob("*.mcap")
+        return path
+
+    def messages(self, kind: type[M]) -> list[M]:
+        """Every recorded message of a class, by port and number."""
+        recording = Recording(self.recording)
+        ids = (id for id, message in recording.messages.items() if message.type == kind.__name__)
+        return [open_envelope(kind, recording.envelope(id)) for id in sorted(ids, key=split_id)]
+
+
+def run_graph(
+    graph: Path | str, *settings: str, folder: Path, seconds: float = PATIENCE_SECONDS, options: Sequence[str] = ()
+) -> Run:
+    """Runs a graph with ``runner up`` in a process of its own and returns how it ended.
+
+    ``graph`` is a file, or as a string the text of one; ``settings`` are ``stage.key=value``, ``options`` further
+    options of ``runner up``. The recording lands in ``folder``. Raises TimeoutError, with all that was printed, where
+    the graph takes longer than ``seconds``; it is ended then.
+    """
+    return finish(start_graph(graph, *settings, folder=folder, options=options), folder, seconds=seconds)
+
+
+def start_graph(graph: Path | str, *settings: str, folder: Path, options: Sequence[str] = ()) -> subprocess.Popen[str]:
+    """Starts what :func:`run_graph` runs, for tests that meddle with it; :func:`finish` waits for its end."""
+    if isinstance(graph, str):
+        path = folder / "graph.yaml"
+        path.write_text(graph)
+        graph = path
+    changes = [part for setting in settings for part in ("--set", setting)]
+    return runner("up", str(graph), "--recordings", str(folder), *changes, *options)
+
+
+def runner(*arguments: str) -> subprocess.Popen[str]:
+    """A command of the runner, started; what it prints comes in a pipe, and it imports what can be imported here."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-m", "runner.cli", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+
+
+def read_until(process: subprocess.Popen[str], text: str, *, seconds: float = PATIENCE_SECONDS) -> str:
+    """What a graph prints up to the line that contains a text, for example ``processes are ready``.
+
+    Raises TimeoutError, with all that was printed, where it ends or ``seconds`` pass without; it is ended then.
+    """
+    assert process.stdout is not None
+    seen = ""
+    limit = threading.Timer(seconds, process.kill)
+    limit.start()
+    try:
+        for line in process.stdout:
+            seen += line
+            if text in line:
+                return seen
+    finally:
+        limit.cancel()
+    process.communicate()
+    raise TimeoutError(f"{text!r} never appeared; it printed:\n{seen}")
+
+
+def finish(process: subprocess.Popen[str], folder: Path, *, before: str = "", seconds: float = PATIENCE_SECONDS) -> Run:
+    """Waits for the end of a graph; ``before`` is what was read of its output already."""
+    try:
+        output, _ = process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        output = before + _ended(process)
+        raise TimeoutError(f"the graph took longer than {seconds:g} s; it printed:\n{output}") from None
+    finally:
+        process.kill()
+    return Run(process.returncode, before + output, folder)
+
+
+def _ended(process: subprocess.Popen[str]) -> str:
+    """Ends a graph, in order if it can, and returns what it printed."""
+    process.terminate()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.communicate(timeout=GRACE_SECONDS)[0]
+    process.kill()
+    return process.communicate()[0]
