@@ -10,7 +10,8 @@ from runner.contract import Refused
 from runner.graph.document import suggest
 from runner.inspect.info import seconds
 from runner.message.codec import Step
-from runner.recording.recording import Recording, topic_of
+from runner.message.ids import MessageId
+from runner.recording.recording import Recording
 
 
 class Causes:
@@ -112,4 +113,4 @@ def path_to(recording: Recording, causes: Causes, id: str) -> list[str]:
 def edge_of(cause: str, step: Step) -> str:
     """``publisher/port -> consumer.port`` of one message that a step consumed."""
     port = next((port for port, id in step.consumed if id == cause), "")
-    return f"{topic_of(cause)} -> {step.stage}.{port}"
+    return f"{MessageId.of(cause).topic} -> {step.stage}.{port}"

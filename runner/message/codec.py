@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Level, Message, Spec
+from runner.message.ids import IdText
 
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=msgspec.Struct)
@@ -49,7 +50,6 @@ class CodecError(Exception):
         super().__init__(f"{type_name}{'.' if field else ''}{field}: {reason}")
 
 
-MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$")]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
@@ -57,9 +57,9 @@ Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 class Envelope(msgspec.Struct, frozen=True):
     """One message as it travels and is recorded: a msgpack map with the message itself under ``body``."""
 
-    id: MessageId
+    id: IdText
     """``stage.port#sequence``."""
-    lineage: MessageId
+    lineage: IdText
     """Id of the message at the root of everything this one hangs on."""
     time_ns: Nanoseconds
     """Logical time."""
@@ -81,9 +81,9 @@ class Step(msgspec.Struct, frozen=True):
     number: Count
     """Counts the steps of one process from 0."""
     handler: str
-    consumed: tuple[tuple[str, MessageId], ...]
+    consumed: tuple[tuple[str, IdText], ...]
     """(port, message id) in the order of the handler's parameters; a gather's parts by index."""
-    emitted: tuple[MessageId, ...]
+    emitted: tuple[IdText, ...]
     """Ids in the order of emission."""
     time_ns: Nanoseconds
     """Logical time of the step."""
@@ -95,7 +95,7 @@ class Step(msgspec.Struct, frozen=True):
     """Time inside the handler."""
     outcome: Outcome = "done"
     error: str = ""
-    left: tuple[tuple[str, MessageId], ...] = ()
+    left: tuple[tuple[str, IdText], ...] = ()
     """(port, message id) of what has arrived and no step of this process will consume: it was refused, or put aside
     unused, or the process ended before; said once."""
 
@@ -121,7 +121,7 @@ class Receipt(msgspec.Struct, frozen=True):
     """What a consumer says of one message (port, id) as it arrives, before it is worked on."""
 
     port: str
-    id: MessageId
+    id: IdText
     consumed: bool = False
     """True for one that arrived again after it had been consumed."""
 

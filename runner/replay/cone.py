@@ -21,9 +21,10 @@ import msgspec
 from runner.contract import Refused
 from runner.graph.graph import Graph, Node
 from runner.message.codec import CodecError, Envelope, Step, pack, unpack
+from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
-from runner.recording.recording import Recording, replicated, split_id
+from runner.recording.recording import Recording, replicated
 from runner.replay.workshop import Forked
 
 AHEAD = 16
@@ -168,7 +169,7 @@ class Cone:
         if node.name not in replicated(self._recording.graph):
             return keys
         place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
-        return sorted(keys, key=lambda key: (split_id(key[2]), place.get(key[1], len(place)), key[3]))
+        return sorted(keys, key=lambda key: (MessageId.of(key[2]), place.get(key[1], len(place)), key[3]))
 
     def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
         log = folder / f"{node.name}-{len(self._forked)}.txt"
@@ -215,9 +216,9 @@ class Cone:
             self._dispatch(self._stages[key[0]], key)
         return bool(keys)
 
-    def _rank(self, key: Key) -> tuple[int, tuple[str, int], Key]:
+    def _rank(self, key: Key) -> tuple[int, MessageId, Key]:
         """Where a step stands in the recording; new ones come last, by lineage."""
-        return self._ranks.get(key, len(self._ranks)), split_id(key[2]), key
+        return self._ranks.get(key, len(self._ranks)), MessageId.of(key[2]), key
 
     def _dispatch(self, stage: _Stage, key: Key) -> None:
         ready, child = stage.take(key)
@@ -253,10 +254,10 @@ class Cone:
         return sealed is not None
 
     def _deliver(self, sealed: Envelope, *, recorded: bool) -> None:
-        source, _, port = split_id(sealed.id)[0].partition(".")
-        for route in self._graph.routes(source):
+        id = MessageId.of(sealed.id)
+        for route in self._graph.routes(id.stage):
             stage = self._stages.get(route.consumer)
-            if route.output != port or stage is None:
+            if route.output != id.port or stage is None:
                 continue
             if recorded and route.policy == "latest" and (route.consumer, route.input, sealed.id) not in self._consumed:
                 continue  # a newer one replaced it
@@ -279,7 +280,7 @@ class _Frozen:
         self._recording = recording
         self._came: set[str] = set()
         self._positions = {id: position for position, id in enumerate(recording.messages)}
-        frozen = (id for id in recording.messages if id.partition(".")[0] not in names)
+        frozen = (id for id in recording.messages if MessageId.of(id).stage not in names)
         self._free = [(self._positions[id], id) for id in frozen]
         """A heap: what may come, oldest first."""
         self._waiting: dict[str, list[str]] = defaultdict(list)

@@ -22,6 +22,7 @@ from runner.graph.document import Document
 from runner.graph.graph import Graph, Node, graph_from_json, graph_to_json, node_from_entry
 from runner.inspect.info import seconds, table
 from runner.inspect.summary import Summary
+from runner.message.ids import MessageId
 from runner.recording.recording import Recording, replicated
 from runner.replay.tasks import Comparison, Reenactment, Result, Task, steps_of
 from runner.replay.tolerances import Origin, load_tolerances
@@ -188,4 +189,4 @@ def tasks_of(recording: Recording, node: Node, workers: int) -> list[Task]:
 
 def emitted_by(stages: Sequence[str], recording: Recording) -> int:
     """How many recorded messages these stages emitted."""
-    return sum(message.topic.partition("/")[0] in stages for message in recording.messages.values())
+    return sum(MessageId.of(id).stage in stages for id in recording.messages)

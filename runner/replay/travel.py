@@ -22,10 +22,11 @@ from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
 from runner.inspect.info import table
 from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
+from runner.message.ids import MessageId
 from runner.process.step import Arrival
-from runner.recording.recording import Recording, replicated, split_id, topic_of
+from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
-from runner.replay.tasks import Execution, Reenactment, Task, envelope_differences, steps_of
+from runner.replay.tasks import Execution, Reenactment, Task, envelope_differences, kind_of, steps_of
 from runner.replay.whatif import change
 
 SHOWN = 76
@@ -77,15 +78,17 @@ def _start(recording: Recording, graph: Graph, until: str | None, condition: str
 def _existing(recording: Recording, id: str) -> str:
     if id in recording.messages:
         return id
-    port, number = split_id(id)
-    numbers = {split_id(other)[1]: other for other in recording.messages if split_id(other)[0] == port}
-    if not numbers:
-        ports = {split_id(other)[0] for other in recording.messages}
-        raise Refused(f"--until {id}: {recording.path} has no message of {port or id!r}{suggest(port, ports)}")
-    near = sorted(numbers, key=lambda other: (abs(other - number), other))[:3]
+    wanted = MessageId.of(id)
+    recorded = [MessageId.of(other) for other in recording.messages]
+    same_port = sorted(other for other in recorded if other.topic == wanted.topic)
+    if not same_port:
+        ports = {f"{other.stage}.{other.port}" for other in recorded}
+        port = id.partition("#")[0]
+        raise Refused(f"--until {id}: {recording.path} has no message of {port!r}{suggest(port, ports)}")
+    near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
     raise Refused(
         f"--until {id}: {recording.path} has no such message; the nearest: "
-        f"{', '.join(numbers[other] for other in sorted(near))} (of {port}#{min(numbers)} to #{max(numbers)})"
+        f"{', '.join(map(str, sorted(near)))} (of {same_port[0]} to #{same_port[-1].sequence})"
     )
 
 
@@ -96,9 +99,9 @@ def first_match(recording: Recording, graph: Graph, condition: str) -> str | Non
     newest: dict[str, dict[str, Message]] = defaultdict(dict)
     for id, located in recording.messages.items():
         if located.topic in expression.topics:
-            stage, _, port = located.topic.partition("/")
+            one = MessageId.of(id)
             sealed = recording.envelope(id)
-            newest[sealed.lineage][located.topic] = _opened(sealed, ports[stage][port])
+            newest[sealed.lineage][located.topic] = _opened(sealed, ports[one.stage][one.port])
             if expression.holds(newest[sealed.lineage]):
                 return id
     return None
@@ -161,9 +164,9 @@ class Traveller:
 
     def moment(self, id: str) -> Moment:
         """Executes the stage that emitted a message up to it."""
-        step, kind = self._causes.step_of(id), self._kind(id)
+        step, kind = self._causes.step_of(id), kind_of(self._graph, id)
         recorded = self._recording.envelope(id)
-        node = self._graph.nodes.get(id.partition(".")[0])
+        node = self._graph.nodes.get(MessageId.of(id).stage)
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
             return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
@@ -173,11 +176,6 @@ class Traveller:
         message = _opened(sealed, kind) if sealed and kind else None
         notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
-
-    def _kind(self, id: str) -> type[Message] | None:
-        stage, port = topic_of(id).split("/")
-        known = stage in self._graph.nodes or stage == SUPERVISOR
-        return self._graph.outputs_of(stage).get(port) if known else None
 
     def _life(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
         """The process that took a step, as far as it has been executed again."""

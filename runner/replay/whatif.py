@@ -17,10 +17,11 @@ from runner.graph.graph import Graph, graph_from_json, load_class, node_entry
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import CodecError, Envelope, open_envelope, pack
-from runner.recording.recording import Recording, split_id, topic_of
+from runner.message.ids import MessageId
+from runner.recording.recording import Recording
 from runner.replay.cone import Cone
 from runner.replay.replay import Say
-from runner.replay.tasks import envelope_differences
+from runner.replay.tasks import envelope_differences, kind_of
 from runner.replay.tolerances import Origin
 
 SHOWN = 5
@@ -145,7 +146,7 @@ class Effects:
 def effects_of(recording: Recording, graph: Graph, names: Collection[str], emitted: Mapping[str, Envelope]) -> Effects:
     """Compares what was emitted with what is recorded of the same stages."""
     effects = Effects()
-    recorded = [id for id in recording.messages if id.partition(".")[0] in names]
+    recorded = (id for id in recording.messages if MessageId.of(id).stage in names)
     for id in recorded:
         if id not in emitted:
             effects.vanished.append(id)
@@ -153,14 +154,10 @@ def effects_of(recording: Recording, graph: Graph, names: Collection[str], emitt
         before, now = recording.envelope(id), emitted[id]
         same = pack(before) == pack(now)
         (effects.identical if same else effects.changed).append(id)
-        effects.summary.add(topic_of(id), id, () if same else envelope_differences(_kind(graph, id), before, now))
+        found = () if same else envelope_differences(kind_of(graph, id), before, now)
+        effects.summary.add(MessageId.of(id).topic, id, found)
     effects.appeared = [id for id in emitted if id not in recording.messages]
     return effects
-
-
-def _kind(graph: Graph, id: str) -> type[Message] | None:
-    stage, _, port = split_id(id)[0].partition(".")
-    return graph.outputs_of(stage).get(port)
 
 
 def _verdict(recording: Recording, graph: Graph, names: Sequence[str], cone: Cone) -> Iterator[str]:
@@ -184,7 +181,7 @@ def _verdict(recording: Recording, graph: Graph, names: Sequence[str], cone: Con
 
 def _by_topic(effects: Effects) -> list[str]:
     kinds = ("identical", "changed", "appeared", "vanished")
-    counts = {kind: Counter(map(topic_of, getattr(effects, kind))) for kind in kinds}
+    counts = {kind: Counter(MessageId.of(id).topic for id in getattr(effects, kind)) for kind in kinds}
     topics = sorted({topic for by_topic in counts.values() for topic in by_topic})
     rows = [(topic, *(str(counts[kind][topic] or "-") for kind in kinds)) for topic in topics]
     return table(("topic", *kinds), rows)
@@ -193,10 +190,10 @@ def _by_topic(effects: Effects) -> list[str]:
 def _devices(graph: Graph, names: Collection[str], effects: Effects) -> Iterator[str]:
     """Where the cone ends at a device: what it would have been sent, and that its recorded answers stand."""
     for device in (node for node in graph.nodes.values() if node.type.cls.device):
-        sources = {f"{edge.stage}.{edge.port}" for edge in device.inputs.values() if edge.stage in names}
+        sources = {f"{edge.stage}/{edge.port}" for edge in device.inputs.values() if edge.stage in names}
         said: list[str] = []
         for kind in ("changed", "appeared", "vanished"):
-            ids = [id for id in getattr(effects, kind) if split_id(id)[0] in sources]
+            ids = [id for id in getattr(effects, kind) if MessageId.of(id).topic in sources]
             said += [f"{kind} {_listed(ids)}"] if ids else []
         if said:
             yield f"device {device.name} would have been sent: {'; '.join(said)}. What it emitted stays as recorded"
@@ -231,7 +228,7 @@ def _score_row(name: str, before: float | None, now: float | None) -> tuple[str,
 def _new_run(recording: Recording, names: Collection[str], cone: Cone) -> Iterator[Envelope]:
     """Every message as it would have been: in the place of the recorded one, new ones at the end."""
     for id in recording.messages:
-        sealed = cone.emitted.get(id) if id.partition(".")[0] in names else cone.frozen.get(id)
+        sealed = cone.emitted.get(id) if MessageId.of(id).stage in names else cone.frozen.get(id)
         if sealed is not None:
             yield sealed
     yield from (sealed for id, sealed in cone.emitted.items() if id not in recording.messages)
@@ -239,7 +236,7 @@ def _new_run(recording: Recording, names: Collection[str], cone: Cone) -> Iterat
 
 def _messages(graph: Graph, run: Iterator[Envelope]) -> Iterator[tuple[str, Message]]:
     for sealed in run:
-        kind = _kind(graph, sealed.id)
+        kind = kind_of(graph, sealed.id)
         if kind is None:
             continue
         try:

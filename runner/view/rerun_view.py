@@ -25,9 +25,10 @@ from mcap.records import Metadata
 from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json, node_entry
 from runner.message.codec import CodecError, Envelope, open_envelope, unpack
+from runner.message.ids import MessageId
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
-from runner.recording.recording import JOURNAL, LOG, RUN, Recording, split_id
+from runner.recording.recording import JOURNAL, LOG, RUN, Recording
 from runner.view.canvas import Canvas
 from runner.view.drawing import Drawing, Views
 
@@ -57,10 +58,10 @@ class Show:
 
 def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
     """What one message shows; what cannot be drawn is named on stderr and left out."""
-    stage, _, port = split_id(sealed.id)[0].partition(".")
+    id = MessageId.of(sealed.id)
     found: list[Drawing] = []
     try:
-        kind = graph.outputs_of(stage).get(port)
+        kind = graph.outputs_of(id.stage).get(id.port)
         if kind is not None:
             found.extend(views.draw(open_envelope(kind, sealed)))
     except Exception as error:  # the rest of the recording is still worth seeing

@@ -10,6 +10,7 @@ from mcap.writer import Writer
 
 from runner.graph.graph import Graph, Node, graph_to_json, load_graph
 from runner.message.codec import Envelope, LogLine, Step, pack
+from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Ready
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import RUN, Verdict
@@ -75,8 +76,8 @@ def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
                 yield from [sealed, journalled(node, "source", (), [sealed])]
     while sent:
         sealed = sent.popleft()
-        stage, _, port = sealed.id.partition("#")[0].partition(".")
-        for route in (route for route in graph.routes(stage) if route.output == port):
+        id = MessageId.of(sealed.id)
+        for route in (route for route in graph.routes(id.stage) if route.output == id.port):
             node = graph.nodes[route.consumer]
             inboxes[node.name].add(receive(node.type.inputs[route.input], sealed))
             while ready := inboxes[node.name].pop():
