@@ -83,7 +83,7 @@ def _existing(recording: Recording, id: str) -> str:
     same_port = sorted(other for other in recorded if other.topic == wanted.topic)
     if not same_port:
         ports = {f"{other.stage}.{other.port}" for other in recorded}
-        port = id.partition("#")[0]
+        port = f"{wanted.stage}.{wanted.port}"
         raise Refused(f"--until {id}: {recording.path} has no message of {port!r}{suggest(port, ports)}")
     near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
     raise Refused(

@@ -32,7 +32,7 @@ def add_commands(commands: Commands) -> None:
 
 def _add_travel(replay: argparse.ArgumentParser) -> None:
     replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
-    text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.weight < 0.5'"
+    text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.winner > 0'"
     replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
     replay.add_argument(
         "--step", action="store_true", help="go from message to message (Enter), from there or the start"
