@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import psutil
 import zenoh
 
 from runner.contract import Refused
@@ -133,7 +134,7 @@ def _version(name: str) -> str | None:
 
 
 def _tested() -> dict[str, str]:
-    path = Path(__file__).parents[1] / "constraints.txt"
+    path = Path(__file__).parents[2] / "constraints.txt"
     lines = path.read_text().splitlines() if path.exists() else []
     pairs = (line.split("==") for line in lines if "==" in line and not line.startswith("#"))
     return {_key(name): version.strip() for name, version in pairs}
@@ -259,7 +260,7 @@ def _recordings(folder: Path) -> Iterator[Finding]:
 
 
 def _memory() -> Iterator[Finding]:
-    available = _meminfo()
+    available = psutil.virtual_memory().available
     limit, used = _group("memory.max"), _group("memory.current")
     if limit is not None and used is not None:
         available = min(available, limit - used)
@@ -267,11 +268,6 @@ def _memory() -> Iterator[Finding]:
     group = f", the control group allows {byte_count(limit)}" if limit is not None else ""
     remedy = "" if enough else "end other programs, or give the container more memory"
     yield Finding("good" if enough else "bad", "memory", f"{byte_count(available)} available{group}", remedy)
-
-
-def _meminfo() -> int:
-    lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    return int(lines["MemAvailable"].split()[0]) * 1024
 
 
 def _group(name: str) -> int | None:
