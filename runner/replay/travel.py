@@ -20,6 +20,7 @@ from runner.contract import Message, Refused, Stage
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
+from runner.inspect.echo import array_text
 from runner.inspect.info import table
 from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
 from runner.message.ids import MessageId
@@ -275,7 +276,7 @@ def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
 def brief(value: Any) -> str:
     """A value in one line."""
     if isinstance(value, np.ndarray):
-        return _brief_array(cast("np.ndarray[Any, Any]", value))
+        return array_text(cast("np.ndarray[Any, Any]", value))
     if isinstance(value, list | tuple) and value:
         items = cast("Sequence[Any]", value)
         if isinstance(items[0], msgspec.Struct | np.ndarray):
@@ -284,15 +285,6 @@ def brief(value: Any) -> str:
         fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
         return _clipped(f"{type(value).__name__}({', '.join(fields)})")
     return _clipped(repr(value))
-
-
-def _brief_array(array: np.ndarray[Any, Any]) -> str:
-    kind = f"{array.dtype.name} {array.shape}"
-    if array.size == 0:
-        return kind
-    if array.size <= 6:
-        return f"{kind} {np.array2string(array, precision=4, separator=', ').replace(chr(10), '')}"
-    return f"{kind} from {array.min():.4g} to {array.max():.4g}"
 
 
 def _clipped(text: str) -> str:

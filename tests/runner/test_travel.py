@@ -47,7 +47,7 @@ def test_stops_at_a_message_and_shows_it_with_its_causes(toys: Path, typed: Type
     assert lines[0] == "gatherer.total#2  Total, of counter.number#2"
     assert lines[1] == "step 2 of gatherer[0], on_answers"
     assert lines[2] == "executed again: identical to the recording"
-    assert lines[3].startswith("samples = float64 (12,) from ")
+    assert lines[3].startswith("samples = float64 (12) [")
     assert "last = False" in lines
     assert "number   counter.number#2  Number" in lines
 

@@ -54,10 +54,11 @@ def _recover(options: argparse.Namespace) -> int:
 
 
 def _why(options: argparse.Namespace) -> int:
-    from runner.inspect.causes import newest, why
+    from runner.inspect.causes import tree
+    from runner.inspect.logs import newest_recording
+    from runner.recording.recording import Recording
 
-    for line in why(options.file or newest(options.recordings), options.id):
-        print(line)
+    print(*tree(Recording(options.file or newest_recording(options.recordings)), options.id), sep="\n")
     return 0
 
 

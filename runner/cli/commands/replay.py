@@ -4,7 +4,7 @@ import argparse
 import os
 import subprocess
 
-from runner.cli.commands import Command, Commands, add, add_file, add_settings
+from runner.cli.commands import Command, Commands, add, add_file, add_settings, count
 from runner.contract import Refused
 
 _EPILOG = """\
@@ -26,7 +26,7 @@ def add_commands(commands: Commands) -> None:
     text = "execute this stage and what follows from it, changed or not; may be given again"
     replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
     replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
-    replay.add_argument("--workers", type=_count, metavar="N", help="stages executed at the same time (one a core)")
+    replay.add_argument("--workers", type=count, metavar="N", help="stages executed at the same time (one a core)")
     _add_travel(replay)
 
 
@@ -38,12 +38,6 @@ def _add_travel(replay: argparse.ArgumentParser) -> None:
         "--step", action="store_true", help="go from message to message (Enter), from there or the start"
     )
     replay.add_argument("--prompt", action="store_true", help="open a Python prompt where it stops, terminal or not")
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
-    return int(text)
 
 
 def _replay(options: argparse.Namespace) -> int:
