@@ -114,7 +114,7 @@ class Execution:
     """True once the handler has nothing more to emit."""
 
 
-class Reenactment:
+class Reexecution:
     """A new instance of a stage and the steps it takes again."""
 
     def __init__(

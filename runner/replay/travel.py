@@ -27,8 +27,8 @@ from runner.message.ids import MessageId
 from runner.process.step import Arrival
 from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
-from runner.replay.tasks import Execution, Reenactment, Task, envelope_differences, kind_of, steps_of
-from runner.replay.whatif import change
+from runner.replay.replay import change
+from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, steps_of
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -148,7 +148,7 @@ class Traveller:
         self._folder = folder
         self._causes = Causes(recording)
         self._log: list[str] = []
-        self._lives: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
+        self._processes: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
         """By stage, replica and incarnation."""
 
     def go(self, start: str, *, step: bool, prompt: bool) -> None:
@@ -171,31 +171,31 @@ class Traveller:
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
             return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
-        stage, executions = self._life(step)
+        stage, executions = self._process_of(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
         message = _opened(sealed, kind) if sealed and kind else None
         notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
 
-    def _life(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
+    def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
         """The process that took a step, as far as it has been executed again."""
         node = self._graph.nodes[step.stage]
         stateful = node.type.cls.stateful
-        life = (step.stage, step.replica, 0 if stateful else step.incarnation)
-        if life not in self._lives:
+        process = (step.stage, step.replica, 0 if stateful else step.incarnation)
+        if process not in self._processes:
             steps = steps_of(self._recording, Task(step.stage, step.incarnation), node)
             if step.stage in replicated(self._recording.graph):
-                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == life)
+                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
                 steps = sorted(mine, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
-            again = Reenactment(
+            again = Reexecution(
                 self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
             )
-            self._lives[life] = again.stage, self._executions(again, steps)
-        return self._lives[life]
+            self._processes[process] = again.stage, self._executions(again, steps)
+        return self._processes[process]
 
-    def _executions(self, again: Reenactment, steps: Sequence[Step]) -> Iterator[Execution]:
+    def _executions(self, again: Reexecution, steps: Sequence[Step]) -> Iterator[Execution]:
         """All steps of a process, message by message; the log is that of the step at hand."""
         for step in steps:
             self._log.clear()

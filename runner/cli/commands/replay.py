@@ -56,7 +56,7 @@ def _replay(options: argparse.Namespace) -> int:
 def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
     """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
     from runner.process.children import PARENT, die_with_parent
-    from runner.replay.workshop import clean_command, is_clean
+    from runner.replay.forks import clean_command, is_clean
 
     if is_clean():
         if PARENT in os.environ:

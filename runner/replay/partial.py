@@ -20,12 +20,12 @@ import msgspec
 
 from runner.contract import Refused
 from runner.graph.graph import Graph, Node
-from runner.message.codec import CodecError, Envelope, Step, pack, unpack
+from runner.message.codec import CodecError, Envelope, Step
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording, replicated
-from runner.replay.workshop import Forked
+from runner.replay.forks import Forked
 
 AHEAD = 16
 """Recorded messages that are delivered while steps run; more would only wait in memory."""
@@ -37,20 +37,20 @@ class Request(msgspec.Struct, frozen=True):
     """A step that a stage's process is to take."""
 
     handler: str
-    inputs: tuple[tuple[str, bytes], ...]
-    """(port, envelope)."""
+    inputs: tuple[tuple[str, Envelope], ...]
+    """By port."""
     time_ns: int
 
 
 class Answer(msgspec.Struct, frozen=True):
     """What came of it."""
 
-    emitted: tuple[bytes, ...] = ()
+    emitted: tuple[Envelope, ...] = ()
     error: str = ""
     seconds: float = 0.0
 
 
-def host(node: Node, seed: int, directory: Path, connection: Connection) -> None:
+def serve(node: Node, seed: int, directory: Path, connection: Connection) -> None:
     """Runs one stage in this process; every request on the connection is a step."""
     try:
         stage = node.construct()
@@ -66,12 +66,11 @@ def host(node: Node, seed: int, directory: Path, connection: Connection) -> None
 
 
 def _answer(node: Node, executor: Executor, request: Request) -> Answer:
-    began, emitted, error = time.perf_counter(), list[bytes](), ""
+    began, emitted, error = time.perf_counter(), list[Envelope](), ""
     handler = next(handler for handler in node.type.handlers if handler.name == request.handler)
     try:
-        ports = node.type.inputs
-        arrivals = [receive(ports[port], unpack(Envelope, data)) for port, data in request.inputs]
-        emitted += (pack(sealed) for sealed in executor.run(handler, arrivals, request.time_ns))
+        arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
+        emitted += executor.run(handler, arrivals, request.time_ns)
     except Exception as problem:
         error = f"{type(problem).__name__}: {problem}"
     return Answer(tuple(emitted), error, time.perf_counter() - began)
@@ -113,7 +112,7 @@ class _Stage:
         return self.ready.pop(key), self.idle.pop()
 
 
-class Cone:
+class PartialReplay:
     """The executed part of a graph, between what is recorded and what is compared."""
 
     def __init__(self, recording: Recording, graph: Graph, names: Collection[str], *, workers: int, folder: Path):
@@ -173,7 +172,7 @@ class Cone:
 
     def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
         log = folder / f"{node.name}-{len(self._forked)}.txt"
-        child = Forked(lambda connection: host(node, self._graph.seed, files, connection), log)
+        child = Forked(lambda connection: serve(node, self._graph.seed, files, connection), log)
         self._forked.append(child)
         return child
 
@@ -222,7 +221,7 @@ class Cone:
 
     def _dispatch(self, stage: _Stage, key: Key) -> None:
         ready, child = stage.take(key)
-        inputs = tuple((arrival.port.name, pack(arrival.envelope)) for arrival in ready.arrivals)
+        inputs = tuple((arrival.port.name, arrival.envelope) for arrival in ready.arrivals)
         time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
         child.connection.send_bytes(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
         self._running[child.connection] = (stage, key, child)
@@ -239,8 +238,7 @@ class Cone:
         self.seconds += answer.seconds
         if answer.error:
             self.errors.append(f"{_step_name(key)}: {answer.error}")
-        for data in answer.emitted:
-            sealed = unpack(Envelope, data)
+        for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
             self._frozen.came(sealed.id)
             self._deliver(sealed, recorded=False)
