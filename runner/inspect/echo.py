@@ -85,19 +85,13 @@ def _scalar(value: Any) -> str:
     return f"{text[:SHOWN_CHARACTERS]}{'...' if len(text) > SHOWN_CHARACTERS else ''}"
 
 
-def _elements(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_elements, cast('list[Any]', value)))}]"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
 def array_text(array: np.ndarray[Any, Any]) -> str:
     """``float32 (480, 640) 0 .. 2.31, mean 0.98``; small arrays with their elements."""
     text = f"{array.dtype.name} ({', '.join(map(str, array.shape))})"
     if array.size == 0:
         return text
     if array.size <= SHOWN_ELEMENTS:
-        return f"{text} {_elements(array.tolist())}"
+        return f"{text} {_scalar(array.tolist())}"
     if array.dtype == np.bool_:
         return f"{text} {np.count_nonzero(array)} of {array.size} true"
     valid = array[np.isfinite(array)] if array.dtype.kind == "f" else array

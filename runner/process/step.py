@@ -105,7 +105,7 @@ class Executor:
         """
         driver = driver_of(handler, arrivals)
         context = self._context(handler, driver, time_ns)
-        arguments = _arguments(arrivals)
+        arguments = arguments_of(arrivals)
         if handler.context is not None:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
@@ -172,7 +172,8 @@ def step_time(node: Node, arrivals: Sequence[Arrival], now_ns: int) -> int:
     return max(arrival.envelope.time_ns for arrival in arrivals)
 
 
-def _arguments(arrivals: Sequence[Arrival]) -> dict[str, Any]:
+def arguments_of(arrivals: Iterable[Arrival]) -> dict[str, Any]:
+    """The messages that a step consumes by port; a list for a gather."""
     arguments: dict[str, Any] = {}
     for arrival in arrivals:
         if arrival.port.kind == "gather":

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Message, Tolerances
+from runner.contract import Message, Refused, Tolerances
 from runner.graph.graph import SUPERVISOR, Graph, Node
 from runner.graph.ports import Handler
 from runner.inspect.compare import Difference, differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, decode, pack
+from runner.message.codec import CodecError, Envelope, Step, decode, open_envelope, pack
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
@@ -271,6 +271,15 @@ def kind_of(graph: Graph, id: str) -> type[Message] | None:
     one = MessageId.of(id)
     known = one.stage in graph.nodes or one.stage == SUPERVISOR
     return graph.outputs_of(one.stage).get(one.port) if known else None
+
+
+def opened(graph: Graph, sealed: Envelope) -> Message | None:
+    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
+    kind = kind_of(graph, sealed.id)
+    try:
+        return open_envelope(kind, sealed) if kind else None
+    except CodecError as error:
+        raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
 def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:

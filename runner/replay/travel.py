@@ -22,13 +22,13 @@ from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
 from runner.inspect.echo import array_text
 from runner.inspect.info import table
-from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
+from runner.message.codec import Envelope, Step, pack
 from runner.message.ids import MessageId
-from runner.process.step import Arrival
+from runner.process.step import Arrival, arguments_of
 from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
-from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, steps_of
+from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, opened, steps_of
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -97,22 +97,13 @@ def first_match(recording: Recording, graph: Graph, condition: str) -> str | Non
     """The first recorded message after which a condition holds for the newest messages of its lineage."""
     ports = {name: graph.outputs_of(name) for name in (*graph.nodes, SUPERVISOR)}
     expression = Expression(condition, ports)
-    newest: dict[str, dict[str, Message]] = defaultdict(dict)
+    newest: dict[str, dict[str, Any]] = defaultdict(dict)
     for id, located in recording.messages.items():
         if located.topic in expression.topics:
-            one = MessageId.of(id)
-            sealed = recording.envelope(id)
-            newest[sealed.lineage][located.topic] = _opened(sealed, ports[one.stage][one.port])
-            if expression.holds(newest[sealed.lineage]):
+            newest[located.lineage][located.topic] = opened(graph, recording.envelope(id))
+            if expression.holds(newest[located.lineage]):
                 return id
     return None
-
-
-def _opened(sealed: Envelope, kind: type[Message]) -> Message:
-    try:
-        return open_envelope(kind, sealed)
-    except CodecError as error:
-        raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
 @dataclass(slots=True)
@@ -126,17 +117,6 @@ class Moment:
     step: Step | None
     arrivals: list[Arrival]
     notes: list[str]
-
-    @property
-    def inputs(self) -> dict[str, Any]:
-        """The messages that the step consumed by port; a list for a gather."""
-        inputs: dict[str, Any] = {}
-        for arrival in self.arrivals:
-            if arrival.port.kind == "gather":
-                inputs.setdefault(arrival.port.name, []).append(arrival.message)
-            else:
-                inputs[arrival.port.name] = arrival.message
-        return inputs
 
 
 class Traveller:
@@ -170,11 +150,11 @@ class Traveller:
         node = self._graph.nodes.get(MessageId.of(id).stage)
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
-            return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
+            return Moment(id, opened(self._graph, recorded), None, step, [], [why])
         stage, executions = self._process_of(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
-        message = _opened(sealed, kind) if sealed and kind else None
+        message = opened(self._graph, sealed) if sealed else None
         notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
 
@@ -223,7 +203,7 @@ class Traveller:
         names: dict[str, Any] = {
             "stage": moment.stage,
             "message": moment.message,
-            "arrivals": moment.inputs,
+            "arrivals": arguments_of(moment.arrivals),
             "recording": self._recording,
         }
         with suppress(ImportError):

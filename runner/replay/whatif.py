@@ -15,12 +15,12 @@ from runner.graph.document import suggest
 from runner.graph.graph import Graph, load_class, node_entry
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
-from runner.message.codec import CodecError, Envelope, open_envelope, pack
+from runner.message.codec import Envelope, pack
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 from runner.replay.partial import PartialReplay
 from runner.replay.replay import Say, change
-from runner.replay.tasks import envelope_differences, kind_of
+from runner.replay.tasks import envelope_differences, kind_of, opened
 from runner.replay.tolerances import Origin
 
 SHOWN = 5
@@ -211,11 +211,5 @@ def _new_run(recording: Recording, names: Collection[str], replay: PartialReplay
 
 
 def _messages(graph: Graph, run: Iterator[Envelope]) -> Iterator[tuple[str, Message]]:
-    for sealed in run:
-        kind = kind_of(graph, sealed.id)
-        if kind is None:
-            continue
-        try:
-            yield sealed.lineage, open_envelope(kind, sealed)
-        except CodecError as error:
-            raise Refused(f"{sealed.id} cannot be scored: {error}") from None
+    messages = ((sealed.lineage, opened(graph, sealed)) for sealed in run)
+    return ((lineage, message) for lineage, message in messages if message is not None)
