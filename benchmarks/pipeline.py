@@ -16,6 +16,7 @@ from runner.graph.graph import Graph
 from runner.graph.ports import Handler
 from runner.message import codec
 from runner.message.codec import Envelope
+from runner.message.ids import MessageId
 from runner.process.inbox import Inbox
 from runner.process.step import Arrival, Executor, receive, step_time
 from stages.messages import SceneEstimate
@@ -152,7 +153,7 @@ class _Look:
     def deliver(self, stage: str, envelopes: Sequence[Envelope]) -> None:
         """Hands messages to every stage that consumes them."""
         for envelope in envelopes:
-            port = envelope.id.partition(".")[2].partition("#")[0]
+            port = MessageId.of(envelope.id).port
             kind = self._graph.nodes[stage].type.outputs[port]
             if stage not in _GIVEN:
                 self.messages.append(codec.open_envelope(kind, envelope))

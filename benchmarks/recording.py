@@ -7,8 +7,8 @@ how many of them the recording holds, its verdict, and what share of one core th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -16,9 +16,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from runner.recording.recording import Recording
+import psutil
 
-_TICKS = os.sysconf("SC_CLK_TCK")
+from runner.recording.recording import Recording
 
 
 def record(folder: Path, seconds: float) -> float:
@@ -56,13 +56,10 @@ def _growing(run: subprocess.Popen[bytes]) -> list[Path]:
 
 
 def _recorder_seconds(supervisor: int) -> float:
-    for task in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (task / "stat").read_text().rpartition(")")[2].split()
-            if int(fields[1]) == supervisor and b"runner.process.recorder" in (task / "cmdline").read_bytes():
-                return (int(fields[11]) + int(fields[12])) / _TICKS
-        except (OSError, IndexError):
-            continue
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(supervisor).children():
+            if "runner.process.recorder" in child.cmdline():
+                return sum(child.cpu_times()[:2])
     return 0.0
 
 

@@ -14,11 +14,11 @@ _RESET = "\033[0m"
 
 
 class Terminal:
-    """Prints lines; colours only where somebody looks."""
+    """Prints lines; colours only where somebody looks, and not with ``NO_COLOR``."""
 
     def __init__(self, stream: TextIO = sys.stdout):
         self._stream = stream
-        self._colours = stream.isatty()
+        self._colours = stream.isatty() and not os.environ.get("NO_COLOR")
         self._started = time.monotonic()
         self._lock = threading.Lock()
 

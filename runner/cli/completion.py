@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Literal
 
 from runner.contract import Refused
+
+if TYPE_CHECKING:
+    from runner.live.live import Live
 
 Shell = Literal["bash", "zsh", "fish"]
 SHELLS: tuple[Shell, ...] = ("bash", "zsh", "fish")
@@ -43,58 +46,30 @@ def run_names(**_: Any) -> list[str]:
     return [entry.run for entry in runs()]
 
 
-def stages(**known: Any) -> list[str]:
-    """The stages of the running graph."""
-    return sorted({process.stage for process in _status(known).processes})
+def _of_run(choices: Callable[[Live, argparse.Namespace], Iterable[str]]) -> Complete:
+    """What the run that was typed, or the only one, has to choose from; nothing where there is none or several."""
+
+    def complete(*, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+        from runner.live.live import Live
+        from runner.supervise.registry import find_run
+
+        with contextlib.suppress(Refused), Live(find_run(parsed_args.run)) as live:
+            return list(dict.fromkeys(choices(live, parsed_args)))
+        return []
+
+    return complete
 
 
-def processes(**known: Any) -> list[str]:
-    """The processes of the running graph that can be restarted."""
-    return [process.name for process in _status(known).processes if process.stage != "recorder"]
-
-
-def topics(**known: Any) -> list[str]:
-    """The topics of the running graph."""
-    return [topic.topic for topic in _status(known).topics]
-
-
-def callable_stages(**known: Any) -> list[str]:
-    """The stages that can be called."""
-    return sorted({command.stage for command in _commands(known)})
-
-
-def command_names(**known: Any) -> list[str]:
-    """The commands of the stage that was typed."""
-    return [command.name for command in _commands(known) if command.stage == known["parsed_args"].stage]
-
-
-def fields(**known: Any) -> list[str]:
-    """The fields of the command that was typed."""
-    typed = known["parsed_args"]
-    found = [one for one in _commands(known) if (one.stage, one.name) == (typed.stage, typed.name)]
-    return [f"{field.name}=" for command in found for field in command.fields]
-
-
-def _status(known: dict[str, Any]) -> Any:
-    return _asked(known, "status", _Nothing())
-
-
-def _commands(known: dict[str, Any]) -> list[Any]:
-    return _asked(known, "commands", [])
-
-
-class _Nothing:
-    """The status of no run."""
-
-    processes: tuple[Any, ...] = ()
-    topics: tuple[Any, ...] = ()
-
-
-def _asked(known: dict[str, Any], question: Literal["status", "commands"], nothing: Any) -> Any:
-    """What the run answers; nothing where there is none or several."""
-    from runner.live.live import Live
-    from runner.supervise.registry import find_run
-
-    with contextlib.suppress(Refused), Live(find_run(known["parsed_args"].run)) as live:
-        return live.status() if question == "status" else live.commands()
-    return nothing
+stages = _of_run(lambda live, _: (one.stage for one in live.status().processes))
+processes = _of_run(lambda live, _: (one.name for one in live.status().processes if one.stage != "recorder"))
+topics = _of_run(lambda live, _: (one.topic for one in live.status().topics))
+callable_stages = _of_run(lambda live, _: (one.stage for one in live.commands()))
+command_names = _of_run(lambda live, typed: (one.name for one in live.commands() if one.stage == typed.stage))
+fields = _of_run(
+    lambda live, typed: (
+        f"{field.name}="
+        for one in live.commands()
+        if (one.stage, one.name) == (typed.stage, typed.name)
+        for field in one.fields
+    )
+)

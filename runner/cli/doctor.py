@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import psutil
+
 from runner.contract import Refused, Stage
 from runner.graph.graph import Node, load_class, load_graph
 from runner.inspect.info import byte_count
@@ -205,7 +207,7 @@ def _recordings(folder: Path) -> Iterator[Finding]:
 
 
 def _memory() -> Iterator[Finding]:
-    available = _meminfo()
+    available = psutil.virtual_memory().available
     limit, used = _group("memory.max"), _group("memory.current")
     if limit is not None and used is not None:
         available = min(available, limit - used)
@@ -213,11 +215,6 @@ def _memory() -> Iterator[Finding]:
     group = f", the control group allows {byte_count(limit)}" if limit is not None else ""
     remedy = "" if enough else "end other programs, or give the container more memory"
     yield Finding("good" if enough else "bad", "memory", f"{byte_count(available)} available{group}", remedy)
-
-
-def _meminfo() -> int:
-    lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    return int(lines["MemAvailable"].split()[0]) * 1024
 
 
 def _group(name: str) -> int | None:

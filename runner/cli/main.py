@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from runner.cli.commands import Command, graphs, inspect, keys, live, machine, new, recordings, replay
+from runner.cli.commands import Command, graphs, keys, live, machine, new, recordings, replay
 from runner.cli.completion import complete_and_exit
 from runner.contract import Refused
 
@@ -36,6 +36,6 @@ def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
     parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (new, graphs, live, recordings, inspect, replay, keys, machine):
+    for group in (new, graphs, live, recordings, replay, keys, machine):
         group.add_commands(commands)
     return parser

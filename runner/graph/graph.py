@@ -589,6 +589,22 @@ def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
             f"{place}: expected {wanted.type.__name__}, but {edge.stage}.{edge.port} is {given.__name__}; "
             f"valid: {fitting}"
         )
+    reason = _needs_all(graph.nodes[name], wanted)
+    if edge.policy == "latest" and reason:
+        place = document.place("stages", name, "inputs", port, "policy")
+        raise Refused(f"{place}: latest leaves messages out, but {reason}; valid: block")
+
+
+def _needs_all(node: Node, port: InputPort) -> str:
+    """Why a stage would wait for ever for what is left out on a port; empty where each message is taken by itself."""
+    handler = node.type.handler_of(port.name)
+    others = ", ".join(other.name for other in handler.inputs if other != port)
+    if port.kind == "gather":
+        return f"{port.name} gathers every part of a lineage"
+    if others:
+        return f"{handler.name} joins {port.name} with {others} of the same lineage"
+    answers = node.replicated or any(issubclass(kind, Part) for kind in node.type.outputs.values())
+    return f"{port.name} takes parts, and each is to be answered" if issubclass(port.type, Part) and answers else ""
 
 
 def _fitting_outputs(graph: Graph, wanted: InputPort) -> Iterator[str]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
 from runner.contract import Refused
 from runner.graph.document import suggest
 from runner.inspect.info import seconds
 from runner.message.codec import Step
-from runner.recording.recording import Recording, topic_of
+from runner.message.ids import MessageId
+from runner.recording.recording import Recording
 
 
 class Causes:
@@ -34,38 +33,26 @@ class Causes:
 
     def last_input(self, id: str) -> str | None:
         """What the step that emitted a message had waited for: the input that was recorded last."""
-        arrived = self._arrival_times
-        return max((cause for _, cause in self.inputs_of(id)), key=lambda cause: arrived.get(cause, 0), default=None)
-
-    @cached_property
-    def _arrival_times(self) -> dict[str, int]:
-        return {id: message.log_time_ns for id, message in self._recording.messages.items()}
+        return last_recorded(self._recording, (cause for _, cause in self.inputs_of(id)))
 
 
-def why(path: Path, id: str) -> list[str]:
-    """The tree of causes of one message as lines; raises Refused where nothing in the recording speaks of it."""
-    return tree(Recording(path), id)
+def last_recorded(recording: Recording, ids: Iterable[str]) -> str | None:
+    """The message that was recorded last; None where there are none."""
+    messages = recording.messages
+    return max(ids, key=lambda id: messages[id].log_time_ns if id in messages else 0, default=None)
 
 
 def tree(recording: Recording, id: str) -> list[str]:
     """The tree of causes as lines: each message with the queueing, transport and computing of its step.
 
     It ends where the message's lineage starts, which for what is perceived is the look. What leads to a message twice
-    is shown once.
+    is shown once. Raises Refused where nothing in the recording speaks of the message.
     """
     causes = Causes(recording)
     if id not in recording.messages and causes.step_of(id) is None:
         raise Refused(f"{recording.path}: no message {id!r}{suggest(id, recording.messages)}")
     root = recording.messages[id].lineage if id in recording.messages else ""
     return list(_lines(recording, causes, id, root))
-
-
-def newest(folder: Path) -> Path:
-    """The newest recording of a folder; raises Refused where there is none."""
-    found = max(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
-    if found is None:
-        raise Refused(f"{folder}: no recording here; valid: runner why ID FILE")
-    return found
 
 
 def _lines(recording: Recording, causes: Causes, id: str, root: str) -> Iterator[str]:
@@ -112,4 +99,4 @@ def path_to(recording: Recording, causes: Causes, id: str) -> list[str]:
 def edge_of(cause: str, step: Step) -> str:
     """``publisher/port -> consumer.port`` of one message that a step consumed."""
     port = next((port for port, id in step.consumed if id == cause), "")
-    return f"{topic_of(cause)} -> {step.stage}.{port}"
+    return f"{MessageId.of(cause).topic} -> {step.stage}.{port}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from runner.inspect.compare import Difference, differences
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import CodecError, Envelope, decode_untyped
+from runner.message.ids import MessageId
 from runner.recording.provenance import changed_packages
-from runner.recording.recording import Recording, topic_of
+from runner.recording.recording import Recording
 
 HEADER = ("lineage", "type", "version", "causes")
 """What is compared of an envelope beside its body. Logical times of devices are the wall clock's: those of two runs
@@ -41,7 +43,7 @@ def _found(first: Recording, second: Recording, summary: Summary) -> Iterator[st
             yield f"{id}: only in {first.path}"
             continue
         changes = list(message_differences(first.recorded(id), second.recorded(id)))
-        if summary.add(topic_of(id), id, changes):
+        if summary.add(MessageId.of(id).topic, id, changes):
             yield f"{id}: {_words(changes[0])}"
     yield from (f"{id}: only in {second.path}" for id in second.messages if id not in first.messages)
 
@@ -70,8 +72,8 @@ def _equal(recording: Recording) -> str:
 def _counts(first: Recording, second: Recording) -> list[str]:
     """Topics of which one recording holds more messages than the other."""
     ids = (first.messages.keys() - second.messages.keys(), second.messages.keys() - first.messages.keys())
-    topics = sorted({topic_of(id) for side in ids for id in side})
-    rows = [(topic, *(str(sum(topic_of(id) == topic for id in side)) for side in ids)) for topic in topics]
+    counts = [Counter(MessageId.of(id).topic for id in side) for side in ids]
+    rows = [(topic, *(str(count[topic]) for count in counts)) for topic in sorted({*counts[0], *counts[1]})]
     return table(("topic", "only in A", "only in B"), rows)
 
 

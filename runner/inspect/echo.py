@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, cast
 
-import msgspec
 import numpy as np
 
 from runner.inspect.info import byte_count
-from runner.message.codec import DTYPES, CodecError, Envelope, unpack
+from runner.message.codec import CodecError, Envelope, decode_untyped, unpack
 
 SHOWN_ELEMENTS = 16
 """Arrays of up to so many elements are written out."""
@@ -22,8 +21,8 @@ def lines_of(payload: bytes | memoryview) -> Iterator[str]:
     """The envelope in one line and its content below; what cannot be read is said, never raised."""
     try:
         envelope = unpack(Envelope, payload)
-        body = msgspec.msgpack.decode(envelope.body)
-    except (CodecError, msgspec.MsgspecError, ValueError, RecursionError) as error:
+        body = decode_untyped(envelope.body)
+    except (CodecError, RecursionError) as error:
         yield f"unreadable, {byte_count(len(payload))}: {error}"
         return
     causes = f" from {', '.join(envelope.causes)}" if envelope.causes else ""
@@ -54,10 +53,7 @@ def _item(value: Any, indent: str) -> list[str]:
 
 
 def _entry(head: str, value: Any, indent: str) -> Iterator[str]:
-    array = as_array(value)
-    if array is not None:
-        yield f"{head} {array_text(array)}"
-    elif _is_nested(value):
+    if _is_nested(value):
         yield head
         yield from _indented(value, indent + "  ")
     elif isinstance(value, str) and "\n" in value:
@@ -69,14 +65,16 @@ def _entry(head: str, value: Any, indent: str) -> Iterator[str]:
 
 def _is_nested(value: Any) -> bool:
     """What does not fit on one line: short lists of plain values do, and arrays."""
-    if not isinstance(value, dict | list) or not value or as_array(cast("Any", value)) is not None:
+    if not isinstance(value, dict | list) or not value:
         return False
     items = cast("list[Any]", value)
-    inner = any(isinstance(item, dict | list) or "\n" in str(item) for item in items)
+    inner = any(isinstance(item, dict | list | np.ndarray) or "\n" in str(item) for item in items)
     return isinstance(value, dict) or inner or len(items) > SHOWN_ELEMENTS
 
 
 def _scalar(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return array_text(cast("np.ndarray[Any, Any]", value))
     if isinstance(value, bytes):
         return f"{byte_count(len(value))} of bytes"
     if isinstance(value, float):
@@ -87,31 +85,13 @@ def _scalar(value: Any) -> str:
     return f"{text[:SHOWN_CHARACTERS]}{'...' if len(text) > SHOWN_CHARACTERS else ''}"
 
 
-def as_array(value: Any) -> np.ndarray | None:
-    """The array that ``[dtype, shape, bytes]`` stands for, or None where it stands for something else."""
-    match value:
-        case [str(name), list(shape), bytes(data)] if name in DTYPES:
-            try:
-                return np.frombuffer(data, DTYPES[name]).reshape(cast("list[int]", shape))
-            except (TypeError, ValueError):
-                return None
-        case _:
-            return None
-
-
-def _elements(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_elements, cast('list[Any]', value)))}]"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def array_text(array: np.ndarray) -> str:
+def array_text(array: np.ndarray[Any, Any]) -> str:
     """``float32 (480, 640) 0 .. 2.31, mean 0.98``; small arrays with their elements."""
     text = f"{array.dtype.name} ({', '.join(map(str, array.shape))})"
     if array.size == 0:
         return text
     if array.size <= SHOWN_ELEMENTS:
-        return f"{text} {_elements(array.tolist())}"
+        return f"{text} {_scalar(array.tolist())}"
     if array.dtype == np.bool_:
         return f"{text} {np.count_nonzero(array)} of {array.size} true"
     valid = array[np.isfinite(array)] if array.dtype.kind == "f" else array

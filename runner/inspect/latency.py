@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runner.inspect.causes import Causes, edge_of, path_to
+from runner.inspect.causes import Causes, edge_of, last_recorded, path_to
 from runner.inspect.info import Cells, seconds, table
 from runner.message.codec import Step
 from runner.recording.recording import Recording
@@ -88,18 +88,13 @@ def _edges(recording: Recording, causes: Causes) -> list[str]:
     travelled: dict[str, list[int]] = defaultdict(list)
     queued: dict[str, list[int]] = defaultdict(list)
     for step in recording.steps:
-        last = _last_input(recording, step)
+        last = last_recorded(recording, (id for _, id in step.consumed))
         if last is not None:
             edge = edge_of(last, step)
             travelled[edge].append(step.travelled_ns)
             queued[edge].append(step.waited_ns)
     rows = ((edge, str(len(travelled[edge])), *_spread(travelled[edge]), *_spread(queued[edge])) for edge in travelled)
     return table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), sorted(rows))
-
-
-def _last_input(recording: Recording, step: Step) -> str | None:
-    known = [id for _, id in step.consumed if id in recording.messages]
-    return max(known, key=lambda id: recording.messages[id].log_time_ns, default=None)
 
 
 def _stages(steps: Iterable[Step]) -> list[str]:

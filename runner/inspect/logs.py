@@ -34,7 +34,7 @@ def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:
 
 def newest_recording(folder: Path) -> Path:
     """The recording that was begun last; raises Refused where there is none."""
-    found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
-    if not found:
+    found = max(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
+    if found is None:
         raise Refused(f"{folder}: no recordings; start a graph: runner up GRAPH, or name a folder: --recordings DIR")
-    return found[-1]
+    return found

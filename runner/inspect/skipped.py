@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 
 from runner.graph.graph import Graph
 from runner.message.codec import Step
+from runner.message.ids import MessageId
 
 
 def skipped(graph: Graph, steps: Iterable[Step]) -> Iterator[str]:
@@ -12,11 +13,11 @@ def skipped(graph: Graph, steps: Iterable[Step]) -> Iterator[str]:
     emitted: Counter[str] = Counter()
     consumed: Counter[tuple[str, str]] = Counter()
     for step in steps:
-        emitted.update(id.partition("#")[0] for id in step.emitted)
+        emitted.update(MessageId.of(id).topic for id in step.emitted)
         consumed.update((step.stage, port) for port, _ in step.consumed)
     for node in graph.nodes.values():
         for port, edge in node.inputs.items():
-            total = emitted[f"{edge.stage}.{edge.port}"]
+            total = emitted[f"{edge.stage}/{edge.port}"]
             left_out = total - consumed[node.name, port]
             if edge.policy == "latest" and left_out > 0:
                 yield f"{node.name}.{port}: {left_out} of {total} messages skipped (policy latest)"

@@ -3,8 +3,9 @@
 import math
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
+from itertools import repeat
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -12,6 +13,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Level, Message, Spec
+from runner.message.ids import IdText
 
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=msgspec.Struct)
@@ -21,7 +23,7 @@ Outcome = Literal["done", "stopped", "failed", "ended"]
 Activity = Literal["waiting", "working", "held back"]
 """What a process does: wait for input, run a handler, or wait for room at its consumers."""
 MAX_BYTES = 256 * 2**20
-"""Largest payload that is decoded."""
+"""Largest payload that is encoded and decoded."""
 MAX_DIMENSIONS = 8
 IN_PLACE_BYTES = 2**16
 """Arrays of larger messages are read where they lie."""
@@ -49,7 +51,6 @@ class CodecError(Exception):
         super().__init__(f"{type_name}{'.' if field else ''}{field}: {reason}")
 
 
-MessageId = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$")]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
@@ -57,9 +58,9 @@ Nanoseconds = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 class Envelope(msgspec.Struct, frozen=True):
     """One message as it travels and is recorded: a msgpack map with the message itself under ``body``."""
 
-    id: MessageId
+    id: IdText
     """``stage.port#sequence``."""
-    lineage: MessageId
+    lineage: IdText
     """Id of the message at the root of everything this one hangs on."""
     time_ns: Nanoseconds
     """Logical time."""
@@ -81,9 +82,9 @@ class Step(msgspec.Struct, frozen=True):
     number: Count
     """Counts the steps of one process from 0."""
     handler: str
-    consumed: tuple[tuple[str, MessageId], ...]
+    consumed: tuple[tuple[str, IdText], ...]
     """(port, message id) in the order of the handler's parameters; a gather's parts by index."""
-    emitted: tuple[MessageId, ...]
+    emitted: tuple[IdText, ...]
     """Ids in the order of emission."""
     time_ns: Nanoseconds
     """Logical time of the step."""
@@ -95,7 +96,7 @@ class Step(msgspec.Struct, frozen=True):
     """Time inside the handler."""
     outcome: Outcome = "done"
     error: str = ""
-    left: tuple[tuple[str, MessageId], ...] = ()
+    left: tuple[tuple[str, IdText], ...] = ()
     """(port, message id) of what has arrived and no step of this process will consume: it was refused, or put aside
     unused, or the process ended before; said once."""
 
@@ -111,7 +112,7 @@ class Lost(msgspec.Struct, frozen=True):
     """Wall clock, nanoseconds since the epoch."""
 
 
-def answered(step: Step) -> tuple[tuple[str, MessageId], ...]:
+def answered(step: Step) -> tuple[tuple[str, IdText], ...]:
     """(port, message id) of what a step has done with; what a process leaves at its end is for its successor."""
     return (*(step.consumed if step.outcome == "done" else ()), *(step.left if step.outcome != "ended" else ()))
 
@@ -120,14 +121,14 @@ class Journal(msgspec.Struct, frozen=True):
     """What the recorder has of one stage, in its order."""
 
     steps: tuple[Step, ...] = ()
-    answered: tuple[tuple[str, MessageId], ...] = ()
+    answered: tuple[tuple[str, IdText], ...] = ()
     """(port, message id) that the stage had done with before the recorder had the message."""
 
 
 class Deal(msgspec.Struct, frozen=True):
     """The part that a replica is to work on; the others leave it alone."""
 
-    id: MessageId
+    id: IdText
 
 
 class LogLine(msgspec.Struct, frozen=True):
@@ -209,19 +210,20 @@ def _array(name: str, shape: list[Any], data: bytes | memoryview) -> np.ndarray:
         raise ValueError(f"shape {str(shape)[:60]} is not a list of at most {MAX_DIMENSIONS} extents")
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {name}")
-    if dtype is _BOOL and bytes(data).strip(b"\x00\x01"):
+    if dtype is _BOOL and np.frombuffer(data, np.uint8).max(initial=0) > 1:
         raise ValueError("a bool is neither 0 nor 1")
     return np.ndarray(shape, dtype, buffer=data)
 
 
-def _check_array(array: np.ndarray, spec: Spec, place: str) -> None:
+def _check_array(array: np.ndarray, spec: Spec) -> None:
     """Raises ValueError unless the array is what its field declares."""
+    _check_size(array.nbytes)
     if array.dtype != DTYPES[spec.dtype]:
-        raise ValueError(f"expected {spec.dtype}, got {array.dtype.name} - at `{place}`")
-    if not _fits(array.shape, spec.shape):
-        raise ValueError(f"expected shape {_shape(spec.shape)}, got {_shape(array.shape)} - at `{place}`")
+        raise ValueError(f"expected {spec.dtype}, got {array.dtype}")
+    if array.shape != spec.shape and not _fits(array.shape, spec.shape):
+        raise ValueError(f"expected shape {_shape(spec.shape)}, got {_shape(array.shape)}")
     if spec.finite and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"NaN or infinity in {np.count_nonzero(~np.isfinite(array))} elements - at `{place}`")
+        raise ValueError(f"NaN or infinity in {np.count_nonzero(~np.isfinite(array))} elements")
 
 
 def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
@@ -238,10 +240,15 @@ def _shape(extents: Iterable[int | str]) -> str:
     return f"({', '.join(str(extent) for extent in extents)})"
 
 
+def _check_size(size: int) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"{size} bytes are more than the limit of {MAX_BYTES}")
+
+
 # ---------------------------------------------------------------------------------------------- checks
 
-Check = Callable[[Any, str], None]
-"""Checks the arrays inside one value; the second argument is its place within the message."""
+Check = Callable[[Any], None]
+"""Checks the arrays inside one value; raises ValueError, with the place within the value as msgspec gives it."""
 
 
 @cache
@@ -257,44 +264,57 @@ def _check_of(annotation: Any) -> Check | None:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         spec = next((extra for extra in arguments[1:] if isinstance(extra, Spec)), None)
-        return _check_of(arguments[0]) if spec is None else lambda value, place: _check_array(value, spec, place)
+        return _check_of(arguments[0]) if spec is None else lambda value: _check_array(value, spec)
     if origin is np.ndarray or annotation is np.ndarray:
         raise TypeError("an array field needs its Spec: Annotated[NDArray[...], Spec(dtype, shape)]")
-    if origin in (Union, UnionType):
-        return _check_union(arguments)
-    if origin in (tuple, list):
-        return _check_items(_check_of(arguments[0]))
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         return _check_struct
-    return None
+    checks = [_check_of(argument) for argument in arguments]
+    if not any(checks):
+        return None
+    if origin in (Union, UnionType):
+        return _check_member(arguments, checks)
+    if issubclass(cast("type", origin), Mapping):
+        return lambda values: _check_each(values.items(), repeat(checks[1]))
+    one_by_one = origin is tuple and arguments[-1] is not ...
+    return lambda values: _check_each(enumerate(values), checks if one_by_one else repeat(checks[0]))
 
 
-def _check_struct(value: Any, place: str) -> None:
+def _check_struct(value: Any) -> None:
     for name, check in _struct_checks(type(value)):
-        check(getattr(value, name), f"{place}.{name}")
+        try:
+            check(getattr(value, name))
+        except ValueError as error:
+            raise _within(f".{name}", error) from None
 
 
-def _check_union(members: tuple[Any, ...]) -> Check | None:
-    checks = [check for check in map(_check_of, members) if check is not None]
-    if not checks:
-        return None
-
-    def check_present(value: Any, place: str) -> None:
-        if value is not None:
-            checks[0](value, place)
-
-    return check_present
+def _check_each(items: Iterable[tuple[Any, Any]], checks: Iterable[Check | None]) -> None:
+    """Checks the values of (index or key, value) pairs."""
+    for (key, value), check in zip(items, checks, strict=False):
+        try:
+            if check is not None:
+                check(value)
+        except ValueError as error:
+            raise _within(f"[{key!r:.40}]", error) from None
 
 
-def _check_items(check: Check | None) -> Check | None:
-    if check is None:
-        return None
+def _check_member(members: tuple[Any, ...], checks: list[Check | None]) -> Check:
+    """Checks a value as the member of a union that it is: msgspec takes members of different kinds only."""
+    bare = (get_args(member)[0] if get_origin(member) is Annotated else member for member in members)
+    kinds = [(get_origin(kind) or kind, check) for kind, check in zip(bare, checks, strict=True) if check is not None]
 
-    def check_each(values: Any, place: str) -> None:
-        for index, value in enumerate(values):
-            check(value, f"{place}[{index}]")
+    def check_member(value: Any) -> None:
+        for kind, check in kinds:
+            if isinstance(value, kind):
+                check(value)
 
-    return check_each
+    return check_member
+
+
+def _within(place: str, error: ValueError) -> ValueError:
+    """The same error, of a value that lies at a place within a larger one."""
+    reason, _, inner = str(error).partition(" - at `")
+    return ValueError(f"{reason} - at `{place}{inner or '`'}")
 
 
 # ---------------------------------------------------------------------------------------------- encode, decode
@@ -317,24 +337,27 @@ def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
 
 
 def encode(message: Message) -> bytes:
-    """The message's bytes; raises CodecError where a field is not what its class declares."""
+    """The message's bytes; raises CodecError where a field is not what its class declares, or it is too large."""
     return b"".join(_encode_in_parts(message))
 
 
-def _encode_in_parts(message: Message) -> tuple[bytes | memoryview, ...]:
-    """What msgspec would write, cut where large arrays lie: they are parts of their own."""
+def _encode_in_parts(message: Message, before: int = 0) -> tuple[bytes | memoryview, ...]:
+    """What msgspec would write after so many bytes, cut where large arrays lie: they are parts of their own."""
     arrays: list[memoryview] = []
 
     def to_wire(value: Any) -> Any:
+        nonlocal before
         wire = _to_wire(value)
         if isinstance(wire, list) and value.nbytes > IN_PLACE_BYTES:
+            before += value.nbytes - len(_CUT)
             arrays.append(memoryview(wire[2]).cast("B"))
             wire[2] = msgspec.Raw(_BIN_32 + value.nbytes.to_bytes(4, "big") + _CUT)
         return cast("Any", wire)
 
     try:
-        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
         _check_fields(message)
+        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
+        _check_size(before + len(body))
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         raise _codec_error(type(message).__name__, error) from None
     if not arrays:
@@ -346,8 +369,7 @@ def _encode_in_parts(message: Message) -> tuple[bytes | memoryview, ...]:
 def _check_fields(message: Message) -> None:
     """What decoding would check, without copying arrays, and made where the blame lies: at the publisher."""
     values = msgspec.to_builtins(message, builtin_types=(np.ndarray, *_BINARY), enc_hook=_to_wire)
-    msgspec.convert(values, type(message), builtin_types=_BINARY, dec_hook=_from_wire)
-    _check_struct(message, "")
+    _check_struct(msgspec.convert(values, type(message), builtin_types=_BINARY, dec_hook=_from_wire))
 
 
 def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
@@ -356,8 +378,8 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     if message is None:
         message = _decode(kind, body)
     try:
-        _check_struct(message, "")
-    except ValueError as error:
+        _check_struct(message)
+    except (ValueError, TypeError) as error:
         raise _codec_error(kind.__name__, error) from None
     return message
 
@@ -396,8 +418,13 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
 
 
 def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> bytes:
-    """A record's bytes, on the wire and in a recording alike."""
-    return _encoder().encode(record)
+    """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many."""
+    payload = _encoder().encode(record)
+    try:
+        _check_size(len(payload))
+    except ValueError as error:
+        raise _codec_error(type(record).__name__, error) from None
+    return payload
 
 
 def unpack(kind: type[R], payload: bytes | memoryview) -> R:
@@ -410,6 +437,8 @@ class Draft(msgspec.Struct, frozen=True):
 
     cover: Envelope
     """All but the body."""
+    head: bytes
+    """The cover's bytes."""
     body: tuple[bytes | memoryview, ...]
 
     def sealed(self) -> Envelope:
@@ -418,14 +447,15 @@ class Draft(msgspec.Struct, frozen=True):
 
     def parts(self) -> tuple[bytes | memoryview, ...]:
         """What :func:`pack` makes of the envelope: a map whose last value is the body."""
-        return pack(self.cover), *self.body
+        return self.head, *self.body
 
 
 def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
-    """Wraps a message for its journey; raises CodecError where the message breaks its class."""
+    """Wraps a message for its journey; raises CodecError where the message breaks its class or is too large."""
     kind = type(message)
     cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
-    return Draft(cover, _encode_in_parts(message))
+    head = pack(cover)
+    return Draft(cover, head, _encode_in_parts(message, len(head)))
 
 
 def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
@@ -467,10 +497,8 @@ def _named(value: Any) -> Any:
 
 
 def _decode(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
-    size = memoryview(payload).nbytes
-    if size > MAX_BYTES:
-        raise CodecError(kind.__name__, "", f"{size} bytes are more than the limit of {MAX_BYTES}")
     try:
+        _check_size(memoryview(payload).nbytes)
         return _decoder(kind).decode(payload)
     except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
         raise _codec_error(kind.__name__, error) from None

@@ -14,6 +14,8 @@ from runner.graph.graph import Node
 from runner.graph.ports import Handler, InputPort, port_name
 from runner.message import codec
 from runner.message.codec import Draft, Envelope
+from runner.message.ids import MessageId
+from runner.message.ids import sequence_of as sequence_of  # noqa: PLC0414 - for its importers
 
 Log = Callable[[str, Level], None]
 """Takes one line of a stage's log."""
@@ -103,7 +105,7 @@ class Executor:
         """
         driver = driver_of(handler, arrivals)
         context = self._context(handler, driver, time_ns)
-        arguments = _arguments(arrivals)
+        arguments = arguments_of(arrivals)
         if handler.context is not None:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
@@ -128,7 +130,7 @@ class Executor:
         self, message: Message, driver: Envelope | None, causes: tuple[str, ...], time_ns: int, taken: set[str]
     ) -> Draft:
         port = self._port_of(message)
-        own = f"{self._node.name}.{port}#{self._number(port, driver, taken)}"
+        own = str(MessageId(self._node.name, port, self._number(port, driver, taken)))
         lineage = own if driver is None or message.starts_lineage else driver.lineage
         return codec.draft(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
 
@@ -145,7 +147,7 @@ class Executor:
             if port in taken:
                 raise BrokenContract(f"emitted two {port} in one step, which a replicated stage may not")
             taken.add(port)
-            return sequence_of(driver.id)
+            return MessageId.of(driver.id).sequence
         number = self._numbers.get(port, 0)
         self._numbers[port] = number + 1
         return number
@@ -170,12 +172,8 @@ def step_time(node: Node, arrivals: Sequence[Arrival], now_ns: int) -> int:
     return max(arrival.envelope.time_ns for arrival in arrivals)
 
 
-def sequence_of(message_id: str) -> int:
-    """The number at the end of ``stage.port#number``."""
-    return int(message_id.rpartition("#")[2])
-
-
-def _arguments(arrivals: Sequence[Arrival]) -> dict[str, Any]:
+def arguments_of(arrivals: Iterable[Arrival]) -> dict[str, Any]:
+    """The messages that a step consumes by port; a list for a gather."""
     arguments: dict[str, Any] = {}
     for arrival in arrivals:
         if arrival.port.kind == "gather":

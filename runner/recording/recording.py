@@ -16,6 +16,8 @@ from mcap.records import Channel, Metadata, Schema
 
 from runner.contract import Refused
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
+from runner.message.ids import split_id
+from runner.message.ids import topic_of as topic_of  # noqa: PLC0414 - for its importers
 from runner.recording.container import Container, Damage, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.provenance import fingerprint, numerical
@@ -43,18 +45,6 @@ def payload_kind(topic: str) -> type[Envelope] | type[Step] | type[LogLine] | ty
     if topic.startswith(JOURNAL):
         return Step
     return LogLine if topic.startswith(LOG) else Envelope
-
-
-def split_id(id: str) -> tuple[str, int]:
-    """``stage.port#sequence`` as port and sequence; sequence 0 where an id is malformed."""
-    port, _, sequence = id.rpartition("#")
-    return port, int(sequence) if sequence.isdecimal() else 0
-
-
-def topic_of(id: str) -> str:
-    """``stage.port#sequence`` is recorded under the topic ``stage/port``."""
-    stage, _, port = split_id(id)[0].partition(".")
-    return f"{stage}/{port}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,57 +12,64 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
 from runner.contract import Refused, Tolerance, Tolerances
-from runner.graph.document import Document
+from runner.graph.document import Document, suggest
 from runner.graph.graph import Graph, Node, graph_from_json, graph_to_json, node_from_entry
-from runner.graph.references import load_tolerances
+from runner.graph.references import load_class, load_tolerances
 from runner.inspect.info import seconds, table
 from runner.inspect.summary import Summary
+from runner.message.ids import MessageId
 from runner.recording.recording import Recording, replicated
-from runner.replay.tasks import Comparison, Reenactment, Result, Task, steps_of
+from runner.replay.forks import Job, run_each
+from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
 from runner.replay.tolerances import Origin
-from runner.replay.workshop import Job, run_each
 
 Say = Callable[[str], None]
 
 
-def changed_graph(recording: Recording, assignments: Sequence[str]) -> str:
-    """JSON of the recorded graph with ``--set`` assignments applied."""
-    document = Document(str(recording.path), Path.cwd(), json.loads(json.dumps(recording.graph)))
+def change(recording: Recording, assignments: Sequence[str] = (), swaps: Sequence[str] = ()) -> Graph:
+    """The recorded graph with other settings and classes."""
+    document = Document(str(recording.path), Path.cwd(), deepcopy(recording.graph))
+    for swap in swaps:
+        _swap(document, swap)
     for assignment in assignments:
         document.set(assignment)
-    return json.dumps(document.values)
+    return graph_from_json(json.dumps(document.values), str(recording.path))
+
+
+def _swap(document: Document, swap: str) -> None:
+    """Another class for a stage; it keeps the settings that it knows."""
+    stage, equals, reference = swap.partition("=")
+    if not equals or ":" not in reference:
+        raise Refused(f"--swap {swap}: expected stage=module:Class, for example --swap ranker=mine:Ranker")
+    stages = cast("dict[str, dict[str, Any]]", document.values["stages"])
+    if stage not in stages:
+        raise Refused(f"--swap {swap}: no stage {stage!r}{suggest(stage, stages)}")
+    config = getattr(load_class(reference, f"--swap {swap}"), "Config", None)
+    known = {setting.name for setting in fields(config)} if is_dataclass(config) else set[str]()
+    kept = {key: value for key, value in stages[stage].get("config", {}).items() if key in known}
+    stages[stage] |= {"stage": reference, "config": kept}
 
 
 def plan(path: Path, say: Say) -> int:
     """Says what a replay would execute."""
     recording = Recording(path)
     recording.require_messages()
-    graph = graph_from_json(json.dumps(recording.graph), str(path))
-    say(f"{path}: {recording.verdict}")
-    for line in _plan(recording, graph):
+    rows: list[tuple[str, ...]] = []
+    for name, node in change(recording).nodes.items():
+        steps = [step for step in recording.steps if step.stage == name]
+        fate = "device: its messages are taken from the recording" if node.type.cls.device else "executed again"
+        rows.append((name, fate, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
+    for line in (f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)):
         say(line)
     return 0
-
-
-def _plan(recording: Recording, graph: Graph) -> list[str]:
-    names = {node.name for node in executed(graph)}
-    rows: list[tuple[str, ...]] = []
-    for name in graph.nodes:
-        steps = [step for step in recording.steps if step.stage == name]
-        fate = "executed again" if name in names else "device: its messages are taken from the recording"
-        rows.append((name, fate, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
-    return table(("stage", "in a replay", "steps", "computed"), rows)
-
-
-def executed(graph: Graph) -> list[Node]:
-    """The stages that a replay executes: all that are no device."""
-    return [node for node in graph.nodes.values() if not node.type.cls.device]
 
 
 def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: Say) -> int:
@@ -80,7 +87,7 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: 
     say(f"{path}: {recording.verdict}")
     values, tolerances = recording.graph, dict[str, Tolerance]()
     if assignments or not origin.same:  # else it was checked when it was recorded: classes are imported as they come
-        graph = graph_from_json(changed_graph(recording, assignments), str(path))
+        graph = change(recording, assignments)
         values, tolerances = json.loads(graph_to_json(graph)), {} if origin.same else _tolerances(graph)
     verification = _Verification(recording, values, tolerances, say)
     return verification.conclude(verification.run(workers or len(os.sched_getaffinity(0))), began)
@@ -131,7 +138,7 @@ class _Verification:
     def _result(self, node: Node, task: Task, folder: Path) -> Result:
         began = time.process_time()
         steps, files = steps_of(self._recording, task, node), Path(tempfile.mkdtemp(dir=folder))
-        again = Reenactment(self._recording, node, steps, seed=self._graph["seed"], directory=files)
+        again = Reexecution(self._recording, node, steps, seed=self._graph["seed"], directory=files)
         startup = time.process_time() - began
         comparison = Comparison(self._recording, node, self._tolerances)
         for step in steps:
@@ -161,7 +168,7 @@ class _Verification:
             self._say(f"DIVERGED first at {found[0]}")
             return 1
         if any(result.failure for result in results) or not verdict.complete:
-            expected = emitted_by(self._executed, self._recording)
+            expected = sum(MessageId.of(id).stage in self._executed for id in self._recording.messages)
             none = "none differs" if not within else f"{within} within tolerances, none beyond"
             self._say(f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {verdict}")
             return 1
@@ -189,8 +196,3 @@ def tasks_of(recording: Recording, node: Node, workers: int) -> list[Task]:
         return [Task(node.name, 0, share, workers) for share in range(workers)]
     lived = {step.incarnation for step in recording.steps if step.stage == node.name}
     return [Task(node.name, incarnation) for incarnation in ([0] if node.type.cls.stateful else sorted(lived))]
-
-
-def emitted_by(stages: Sequence[str], recording: Recording) -> int:
-    """How many recorded messages these stages emitted."""
-    return sum(message.topic.partition("/")[0] in stages for message in recording.messages.values())

@@ -11,15 +11,16 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Message, Tolerances
-from runner.graph.graph import Node
+from runner.contract import Message, Refused, Tolerances
+from runner.graph.graph import SUPERVISOR, Graph, Node
 from runner.graph.ports import Handler
 from runner.inspect.compare import Difference, differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, decode, pack
+from runner.message.codec import CodecError, Envelope, Step, decode, open_envelope, pack
+from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
-from runner.recording.recording import Recording, replicated, split_id, topic_of
+from runner.recording.recording import Recording, replicated
 from runner.replay.tolerances import outside
 
 HEADER = tuple(name for name in Envelope.__struct_fields__ if name != "body")
@@ -113,7 +114,7 @@ class Execution:
     """True once the handler has nothing more to emit."""
 
 
-class Reenactment:
+class Reexecution:
     """A new instance of a stage and the steps it takes again."""
 
     def __init__(
@@ -240,12 +241,12 @@ class Comparison:
         replayed = without_gained_fields(recorded, replayed)
         if pack(recorded) == pack(replayed):
             return ""
-        kind = self._node.type.outputs.get(topic_of(id).partition("/")[2])
+        kind = self._node.type.outputs.get(MessageId.of(id).port)
         try:
             found = list(envelope_differences(kind, recorded, replayed))
         except CodecError as error:
             return f"the recorded message cannot be read: {error}"
-        self._summary.add(topic_of(id), id, found)
+        self._summary.add(MessageId.of(id).topic, id, found)
         beyond = next(outside(found, self._tolerances), None)
         if beyond is None and found and self._tolerances:
             self._within += 1
@@ -265,9 +266,25 @@ def envelope_differences(kind: type[Message] | None, recorded: Envelope, replaye
         yield from differences(decode(kind, recorded.body), decode(kind, replayed.body))
 
 
+def kind_of(graph: Graph, id: str) -> type[Message] | None:
+    """The class of a message; None where the graph has no such output."""
+    one = MessageId.of(id)
+    known = one.stage in graph.nodes or one.stage == SUPERVISOR
+    return graph.outputs_of(one.stage).get(one.port) if known else None
+
+
+def opened(graph: Graph, sealed: Envelope) -> Message | None:
+    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
+    kind = kind_of(graph, sealed.id)
+    try:
+        return open_envelope(kind, sealed) if kind else None
+    except CodecError as error:
+        raise Refused(f"{sealed.id} cannot be read: {error}") from None
+
+
 def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:
     """Where the sequence of each port went on in this incarnation."""
     numbers: dict[str, int] = {}
-    for id in (id for step in steps for id in step.emitted):
-        numbers.setdefault(topic_of(id).partition("/")[2], split_id(id)[1])
+    for id in (MessageId.of(id) for step in steps for id in step.emitted):
+        numbers.setdefault(id.port, id.sequence)
     return numbers

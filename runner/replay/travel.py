@@ -20,13 +20,15 @@ from runner.contract import Message, Refused, Stage
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
+from runner.inspect.echo import array_text
 from runner.inspect.info import table
-from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
-from runner.process.step import Arrival
-from runner.recording.recording import Recording, replicated, split_id, topic_of
+from runner.message.codec import Envelope, Step, pack
+from runner.message.ids import MessageId
+from runner.process.step import Arrival, arguments_of
+from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
-from runner.replay.tasks import Execution, Reenactment, Task, envelope_differences, steps_of
-from runner.replay.whatif import change
+from runner.replay.replay import change
+from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, opened, steps_of
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -77,15 +79,17 @@ def _start(recording: Recording, graph: Graph, until: str | None, condition: str
 def _existing(recording: Recording, id: str) -> str:
     if id in recording.messages:
         return id
-    port, number = split_id(id)
-    numbers = {split_id(other)[1]: other for other in recording.messages if split_id(other)[0] == port}
-    if not numbers:
-        ports = {split_id(other)[0] for other in recording.messages}
-        raise Refused(f"--until {id}: {recording.path} has no message of {port or id!r}{suggest(port, ports)}")
-    near = sorted(numbers, key=lambda other: (abs(other - number), other))[:3]
+    wanted = MessageId.of(id)
+    recorded = [MessageId.of(other) for other in recording.messages]
+    same_port = sorted(other for other in recorded if other.topic == wanted.topic)
+    if not same_port:
+        ports = {f"{other.stage}.{other.port}" for other in recorded}
+        port = f"{wanted.stage}.{wanted.port}"
+        raise Refused(f"--until {id}: {recording.path} has no message of {port!r}{suggest(port, ports)}")
+    near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
     raise Refused(
         f"--until {id}: {recording.path} has no such message; the nearest: "
-        f"{', '.join(numbers[other] for other in sorted(near))} (of {port}#{min(numbers)} to #{max(numbers)})"
+        f"{', '.join(map(str, sorted(near)))} (of {same_port[0]} to #{same_port[-1].sequence})"
     )
 
 
@@ -93,22 +97,13 @@ def first_match(recording: Recording, graph: Graph, condition: str) -> str | Non
     """The first recorded message after which a condition holds for the newest messages of its lineage."""
     ports = {name: graph.outputs_of(name) for name in (*graph.nodes, SUPERVISOR)}
     expression = Expression(condition, ports)
-    newest: dict[str, dict[str, Message]] = defaultdict(dict)
+    newest: dict[str, dict[str, Any]] = defaultdict(dict)
     for id, located in recording.messages.items():
         if located.topic in expression.topics:
-            stage, _, port = located.topic.partition("/")
-            sealed = recording.envelope(id)
-            newest[sealed.lineage][located.topic] = _opened(sealed, ports[stage][port])
-            if expression.holds(newest[sealed.lineage]):
+            newest[located.lineage][located.topic] = opened(graph, recording.envelope(id))
+            if expression.holds(newest[located.lineage]):
                 return id
     return None
-
-
-def _opened(sealed: Envelope, kind: type[Message]) -> Message:
-    try:
-        return open_envelope(kind, sealed)
-    except CodecError as error:
-        raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
 @dataclass(slots=True)
@@ -123,17 +118,6 @@ class Moment:
     arrivals: list[Arrival]
     notes: list[str]
 
-    @property
-    def inputs(self) -> dict[str, Any]:
-        """The messages that the step consumed by port; a list for a gather."""
-        inputs: dict[str, Any] = {}
-        for arrival in self.arrivals:
-            if arrival.port.kind == "gather":
-                inputs.setdefault(arrival.port.name, []).append(arrival.message)
-            else:
-                inputs[arrival.port.name] = arrival.message
-        return inputs
-
 
 class Traveller:
     """Goes from message to message; stages are constructed when the first of their messages is reached."""
@@ -144,7 +128,7 @@ class Traveller:
         self._folder = folder
         self._causes = Causes(recording)
         self._log: list[str] = []
-        self._lives: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
+        self._processes: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
         """By stage, replica and incarnation."""
 
     def go(self, start: str, *, step: bool, prompt: bool) -> None:
@@ -161,42 +145,37 @@ class Traveller:
 
     def moment(self, id: str) -> Moment:
         """Executes the stage that emitted a message up to it."""
-        step, kind = self._causes.step_of(id), self._kind(id)
+        step, kind = self._causes.step_of(id), kind_of(self._graph, id)
         recorded = self._recording.envelope(id)
-        node = self._graph.nodes.get(id.partition(".")[0])
+        node = self._graph.nodes.get(MessageId.of(id).stage)
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
-            return Moment(id, _opened(recorded, kind) if kind else None, None, step, [], [why])
-        stage, executions = self._life(step)
+            return Moment(id, opened(self._graph, recorded), None, step, [], [why])
+        stage, executions = self._process_of(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
-        message = _opened(sealed, kind) if sealed and kind else None
+        message = opened(self._graph, sealed) if sealed else None
         notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
 
-    def _kind(self, id: str) -> type[Message] | None:
-        stage, port = topic_of(id).split("/")
-        known = stage in self._graph.nodes or stage == SUPERVISOR
-        return self._graph.outputs_of(stage).get(port) if known else None
-
-    def _life(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
+    def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
         """The process that took a step, as far as it has been executed again."""
         node = self._graph.nodes[step.stage]
         stateful = node.type.cls.stateful
-        life = (step.stage, step.replica, 0 if stateful else step.incarnation)
-        if life not in self._lives:
+        process = (step.stage, step.replica, 0 if stateful else step.incarnation)
+        if process not in self._processes:
             steps = steps_of(self._recording, Task(step.stage, step.incarnation), node)
             if step.stage in replicated(self._recording.graph):
-                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == life)
+                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
                 steps = sorted(mine, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
-            again = Reenactment(
+            again = Reexecution(
                 self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
             )
-            self._lives[life] = again.stage, self._executions(again, steps)
-        return self._lives[life]
+            self._processes[process] = again.stage, self._executions(again, steps)
+        return self._processes[process]
 
-    def _executions(self, again: Reenactment, steps: Sequence[Step]) -> Iterator[Execution]:
+    def _executions(self, again: Reexecution, steps: Sequence[Step]) -> Iterator[Execution]:
         """All steps of a process, message by message; the log is that of the step at hand."""
         for step in steps:
             self._log.clear()
@@ -224,7 +203,7 @@ class Traveller:
         names: dict[str, Any] = {
             "stage": moment.stage,
             "message": moment.message,
-            "arrivals": moment.inputs,
+            "arrivals": arguments_of(moment.arrivals),
             "recording": self._recording,
         }
         with suppress(ImportError):
@@ -277,7 +256,7 @@ def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
 def brief(value: Any) -> str:
     """A value in one line."""
     if isinstance(value, np.ndarray):
-        return _brief_array(cast("np.ndarray[Any, Any]", value))
+        return array_text(cast("np.ndarray[Any, Any]", value))
     if isinstance(value, list | tuple) and value:
         items = cast("Sequence[Any]", value)
         if isinstance(items[0], msgspec.Struct | np.ndarray):
@@ -286,15 +265,6 @@ def brief(value: Any) -> str:
         fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
         return _clipped(f"{type(value).__name__}({', '.join(fields)})")
     return _clipped(repr(value))
-
-
-def _brief_array(array: np.ndarray[Any, Any]) -> str:
-    kind = f"{array.dtype.name} {array.shape}"
-    if array.size == 0:
-        return kind
-    if array.size <= 6:
-        return f"{kind} {np.array2string(array, precision=4, separator=', ').replace(chr(10), '')}"
-    return f"{kind} from {array.min():.4g} to {array.max():.4g}"
 
 
 def _clipped(text: str) -> str:

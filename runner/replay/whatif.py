@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from runner.contract import Message, Refused, Scorer
-from runner.graph.document import Document, suggest
-from runner.graph.graph import Graph, graph_from_json, node_entry
+from runner.graph.document import suggest
+from runner.graph.graph import Graph, node_entry
 from runner.graph.references import load_class
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
-from runner.message.codec import CodecError, Envelope, open_envelope, pack
-from runner.recording.recording import Recording, split_id, topic_of
-from runner.replay.cone import Cone
-from runner.replay.replay import Say
-from runner.replay.tasks import envelope_differences
+from runner.message.codec import Envelope, pack
+from runner.message.ids import MessageId
+from runner.recording.recording import Recording
+from runner.replay.partial import PartialReplay
+from runner.replay.replay import Say, change
+from runner.replay.tasks import envelope_differences, kind_of, opened
 from runner.replay.tolerances import Origin
 
 SHOWN = 5
@@ -45,47 +45,24 @@ def what_if(
     recording = Recording(path)
     recording.require_messages()
     graph = change(recording, assignments, swaps)
-    names = cone_of(graph, _changed(recording, graph) | _known(graph, origins, "--from"))
+    names = affected_by(graph, _changed(recording, graph) | _known(graph, origins, "--from"))
     for line in (*Origin(recording).lines(), f"{path}: {recording.verdict}", *_plan(graph, names)):
         say(line)
     with tempfile.TemporaryDirectory() as folder:
-        cone = Cone(recording, graph, names, workers=workers or len(os.sched_getaffinity(0)), folder=Path(folder))
-        cone.run()
-    for line in _verdict(recording, graph, names, cone):
+        workers = workers or len(os.sched_getaffinity(0))
+        replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
+        replay.run()
+    for line in _verdict(recording, graph, names, replay):
         say(line)
-    return int(bool(cone.errors))
+    return int(bool(replay.errors))
 
 
 # ------------------------------------------------------------------------------------ the change
 
 
-def change(recording: Recording, assignments: Sequence[str], swaps: Sequence[str]) -> Graph:
-    """The recorded graph with other settings and classes."""
-    document = Document(str(recording.path), Path.cwd(), json.loads(json.dumps(recording.graph)))
-    for swap in swaps:
-        _swap(document, swap)
-    for assignment in assignments:
-        document.set(assignment)
-    return graph_from_json(json.dumps(document.values), str(recording.path))
-
-
-def _swap(document: Document, swap: str) -> None:
-    """Another class for a stage; it keeps the settings that it knows."""
-    stage, equals, reference = swap.partition("=")
-    if not equals or ":" not in reference:
-        raise Refused(f"--swap {swap}: expected stage=module:Class, for example --swap ranker=mine:Ranker")
-    stages = cast("dict[str, dict[str, Any]]", document.values["stages"])
-    if stage not in stages:
-        raise Refused(f"--swap {swap}: no stage {stage!r}{suggest(stage, stages)}")
-    config = getattr(load_class(reference, f"--swap {swap}"), "Config", None)
-    known = {setting.name for setting in fields(config)} if is_dataclass(config) else set[str]()
-    kept = {key: value for key, value in stages[stage].get("config", {}).items() if key in known}
-    stages[stage] |= {"stage": reference, "config": kept}
-
-
 def _changed(recording: Recording, graph: Graph) -> set[str]:
     """The stages that are not as recorded; all where the seed is another."""
-    before = graph_from_json(json.dumps(recording.graph), str(recording.path))
+    before = change(recording)
     if before.seed != graph.seed:
         return {name for name, node in graph.nodes.items() if not node.type.cls.device}
     changed = {name for name in graph.nodes if node_entry(graph.nodes[name]) != node_entry(before.nodes[name])}
@@ -105,7 +82,7 @@ def _known(graph: Graph, names: Sequence[str], option: str) -> set[str]:
     return set(names)
 
 
-def cone_of(graph: Graph, origins: Collection[str]) -> list[str]:
+def affected_by(graph: Graph, origins: Collection[str]) -> list[str]:
     """The stages that follow from some, themselves included, as far as the next devices; in the graph's order."""
     found, waiting = set[str](), list(origins)
     while waiting:
@@ -146,7 +123,7 @@ class Effects:
 def effects_of(recording: Recording, graph: Graph, names: Collection[str], emitted: Mapping[str, Envelope]) -> Effects:
     """Compares what was emitted with what is recorded of the same stages."""
     effects = Effects()
-    recorded = [id for id in recording.messages if id.partition(".")[0] in names]
+    recorded = (id for id in recording.messages if MessageId.of(id).stage in names)
     for id in recorded:
         if id not in emitted:
             effects.vanished.append(id)
@@ -154,18 +131,14 @@ def effects_of(recording: Recording, graph: Graph, names: Collection[str], emitt
         before, now = recording.envelope(id), emitted[id]
         same = pack(before) == pack(now)
         (effects.identical if same else effects.changed).append(id)
-        effects.summary.add(topic_of(id), id, () if same else envelope_differences(_kind(graph, id), before, now))
+        found = () if same else envelope_differences(kind_of(graph, id), before, now)
+        effects.summary.add(MessageId.of(id).topic, id, found)
     effects.appeared = [id for id in emitted if id not in recording.messages]
     return effects
 
 
-def _kind(graph: Graph, id: str) -> type[Message] | None:
-    stage, _, port = split_id(id)[0].partition(".")
-    return graph.outputs_of(stage).get(port)
-
-
-def _verdict(recording: Recording, graph: Graph, names: Sequence[str], cone: Cone) -> Iterator[str]:
-    effects = effects_of(recording, graph, names, cone.emitted)
+def _verdict(recording: Recording, graph: Graph, names: Sequence[str], replay: PartialReplay) -> Iterator[str]:
+    effects = effects_of(recording, graph, names, replay.emitted)
     yield ""
     yield from _by_topic(effects)
     if effects.changed:
@@ -173,31 +146,31 @@ def _verdict(recording: Recording, graph: Graph, names: Sequence[str], cone: Con
         yield from effects.summary.lines()
     yield from (f"{kind}: {_listed(ids)}" for kind in ("appeared", "vanished") if (ids := getattr(effects, kind)))
     yield from _devices(graph, names, effects)
-    lost = cone.never_came()
+    lost = replay.never_came()
     if lost:
         yield f"devices answered what is not asked any more, left out: {_listed(lost)}"
-    yield from (f"FAILED {error}" for error in cone.errors)
+    yield from (f"FAILED {error}" for error in replay.errors)
     yield ""
-    yield from _scores(recording, graph, names, cone)
+    yield from _scores(recording, graph, names, replay)
     same = not (effects.changed or effects.appeared or effects.vanished)
     yield f"{'NOTHING CHANGES' if same else 'CHANGED'}: {effects.words}, of {len(names)} stages"
 
 
 def _by_topic(effects: Effects) -> list[str]:
     kinds = ("identical", "changed", "appeared", "vanished")
-    counts = {kind: Counter(map(topic_of, getattr(effects, kind))) for kind in kinds}
+    counts = {kind: Counter(MessageId.of(id).topic for id in getattr(effects, kind)) for kind in kinds}
     topics = sorted({topic for by_topic in counts.values() for topic in by_topic})
     rows = [(topic, *(str(counts[kind][topic] or "-") for kind in kinds)) for topic in topics]
     return table(("topic", *kinds), rows)
 
 
 def _devices(graph: Graph, names: Collection[str], effects: Effects) -> Iterator[str]:
-    """Where the cone ends at a device: what it would have been sent, and that its recorded answers stand."""
+    """Where it ends at a device: what it would have been sent, and that its recorded answers stand."""
     for device in (node for node in graph.nodes.values() if node.type.cls.device):
-        sources = {f"{edge.stage}.{edge.port}" for edge in device.inputs.values() if edge.stage in names}
+        sources = {f"{edge.stage}/{edge.port}" for edge in device.inputs.values() if edge.stage in names}
         said: list[str] = []
         for kind in ("changed", "appeared", "vanished"):
-            ids = [id for id in getattr(effects, kind) if split_id(id)[0] in sources]
+            ids = [id for id in getattr(effects, kind) if MessageId.of(id).topic in sources]
             said += [f"{kind} {_listed(ids)}"] if ids else []
         if said:
             yield f"device {device.name} would have been sent: {'; '.join(said)}. What it emitted stays as recorded"
@@ -211,7 +184,7 @@ def _listed(ids: Sequence[str]) -> str:
 # ------------------------------------------------------------------------------------ the score
 
 
-def _scores(recording: Recording, graph: Graph, names: Collection[str], cone: Cone) -> Iterator[str]:
+def _scores(recording: Recording, graph: Graph, names: Collection[str], replay: PartialReplay) -> Iterator[str]:
     """A table of what the graph's scorer says of both; a line where there is none."""
     if graph.score is None:
         yield "no score: the graph names none; valid: --set score=module:Class"
@@ -219,7 +192,7 @@ def _scores(recording: Recording, graph: Graph, names: Collection[str], cone: Co
     cls = load_class(graph.score, f"score of graph {graph.name!r}")
     scorer = cast("Scorer", cls({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
     before = scorer.score(_messages(graph, recording.envelopes()))
-    now = scorer.score(_messages(graph, _new_run(recording, names, cone)))
+    now = scorer.score(_messages(graph, _new_run(recording, names, replay)))
     rows = [_score_row(name, before.get(name), now.get(name)) for name in {**before, **now}]
     yield from table(("score", "recorded", "now", "change"), rows) or ["no score: the recording holds nothing to score"]
 
@@ -229,21 +202,15 @@ def _score_row(name: str, before: float | None, now: float | None) -> tuple[str,
     return name, *("-" if value is None else f"{value:.4g}" for value in (before, now)), change
 
 
-def _new_run(recording: Recording, names: Collection[str], cone: Cone) -> Iterator[Envelope]:
+def _new_run(recording: Recording, names: Collection[str], replay: PartialReplay) -> Iterator[Envelope]:
     """Every message as it would have been: in the place of the recorded one, new ones at the end."""
     for id in recording.messages:
-        sealed = cone.emitted.get(id) if id.partition(".")[0] in names else cone.frozen.get(id)
+        sealed = replay.emitted.get(id) if MessageId.of(id).stage in names else replay.frozen.get(id)
         if sealed is not None:
             yield sealed
-    yield from (sealed for id, sealed in cone.emitted.items() if id not in recording.messages)
+    yield from (sealed for id, sealed in replay.emitted.items() if id not in recording.messages)
 
 
 def _messages(graph: Graph, run: Iterator[Envelope]) -> Iterator[tuple[str, Message]]:
-    for sealed in run:
-        kind = _kind(graph, sealed.id)
-        if kind is None:
-            continue
-        try:
-            yield sealed.lineage, open_envelope(kind, sealed)
-        except CodecError as error:
-            raise Refused(f"{sealed.id} cannot be scored: {error}") from None
+    messages = ((sealed.lineage, opened(graph, sealed)) for sealed in run)
+    return ((lineage, message) for lineage, message in messages if message is not None)

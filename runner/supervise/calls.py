@@ -21,6 +21,7 @@ from runner.graph.document import suggest
 from runner.graph.graph import Graph, Node, command_port
 from runner.graph.ports import port_name
 from runner.message.codec import LogLine, Step
+from runner.message.ids import MessageId
 
 KEPT = 100
 """Calls that may still be asked about."""
@@ -185,8 +186,7 @@ class Calls:
             call.left.discard(step.replica)
         if call.step is None or call.left:
             return
-        wanted = {f"{call.stage}.{answer}" for answer in call.answers}
-        answers = [id for id in step.emitted if id.partition("#")[0] in wanted]
+        answers = [id for id in step.emitted if MessageId.of(id).port in call.answers]
         call.payload = self._answers.get(answers[0], b"") if answers else b""
         call.done = not call.answers or bool(call.payload) or bool(call.step.error)
 

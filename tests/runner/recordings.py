@@ -9,6 +9,7 @@ from mcap.writer import Writer
 
 from runner.graph.graph import Graph, graph_to_json, load_graph
 from runner.message.codec import Envelope, LogLine, Step, pack
+from runner.message.ids import MessageId
 from runner.recording.recording import RUN, Verdict
 from runner.recording.writer import Manifest, RecordingWriter, topic
 from runner.testing import Bench, Done
@@ -64,8 +65,8 @@ def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
         yield from records(stage, bench.advance())
     while sent:
         sealed = sent.popleft()
-        stage, _, port = sealed.id.partition("#")[0].partition(".")
-        for route in (route for route in graph.routes(stage) if route.output == port):
+        id = MessageId.of(sealed.id)
+        for route in (route for route in graph.routes(id.stage) if route.output == id.port):
             yield from records(route.consumer, benches[route.consumer].take(route.input, sealed))
 
 

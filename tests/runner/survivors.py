@@ -1,5 +1,6 @@
 """Toy stages in trouble: they crash, hang, grow, never start, remember and are slow."""
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from runner.contract import Context, Finished, Message, Refused, Spec, Stage
@@ -155,10 +157,9 @@ def living(marks: Path) -> list[int]:
 
 
 def lives(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 class NeverReady(Stage):

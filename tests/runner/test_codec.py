@@ -1,7 +1,8 @@
 """Messages survive the wire bit for bit, and nothing malformed gets past it."""
 
 import json
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 from unittest import mock
 
 import jsonschema
@@ -156,14 +157,21 @@ def test_hostile_bytes_are_refused(payload: bytes):
         ({"square": np.full((1, 1), np.nan)}, "square", "NaN or infinity in 1 elements"),
         ({"things": (Thing(pose=np.eye(2)), Thing(pose=np.ones((1, 2))))}, "things[1].pose", "expected shape"),
         ({"scale": "wide"}, "scale", "Expected `float`"),
-        ({"image": np.array([object()])}, "", "an array of object cannot be encoded"),
-        ({"image": np.zeros(1, ">f8")}, "", "an array of >f8 cannot be encoded"),
+        ({"image": np.array([object()])}, "image", "expected uint8, got object"),
+        ({"square": np.zeros((1, 1), ">f8")}, "square", "expected float64, got >f8"),
     ],
 )
 def test_a_publisher_is_told_which_field_is_wrong(changes: dict[str, object], place: str, reason: str):
     with pytest.raises(CodecError, match=reason) as caught:
         codec.encode(sample(**changes))
     assert (caught.value.type, caught.value.field) == ("Sample", place)
+
+
+@pytest.mark.parametrize("value", [np.array([object()]), np.zeros(1, ">f8"), object()])
+def test_what_has_no_form_on_the_wire_is_refused(value: object):
+    kind = msgspec.defstruct("Loose", [("value", Any)], bases=(Message,), frozen=True, kw_only=True)
+    with pytest.raises(CodecError, match=r"Loose: .* cannot be encoded"):
+        codec.encode(kind(value=value))
 
 
 @pytest.mark.parametrize(
@@ -183,10 +191,115 @@ def test_a_malformed_array_is_refused(array: object, reason: str):
     assert caught.value.field == "image"
 
 
+class Ball(Struct, frozen=True, kw_only=True, tag=True):
+    radii: Mask
+
+
+class Cube(Struct, frozen=True, kw_only=True, tag=True):
+    sides: Square
+
+
+class Nest(Message, frozen=True, kw_only=True):
+    """Arrays wherever they can be."""
+
+    by_name: dict[str, Square] = msgspec.field(default_factory=dict)
+    pair: tuple[Mask, Square] | None = None
+    many: tuple[Square, ...] | Mapping[str, Square] = ()
+    either: Ball | Cube | None = None
+    deep: list[dict[str, tuple[Ball | Cube, ...]]] = msgspec.field(default_factory=list)
+
+
+masks = hnp.arrays(np.bool_, st.integers(0, 5))
+shapes = st.builds(Ball, radii=masks) | st.builds(Cube, sides=squares)
+several = st.lists(squares, max_size=3).map(tuple)
+named = st.dictionaries(st.text(max_size=3), squares, max_size=3)
+nests = st.builds(
+    Nest,
+    by_name=named,
+    pair=st.none() | st.tuples(masks, squares),
+    many=several | named,
+    either=st.none() | shapes,
+    deep=st.lists(
+        st.dictionaries(st.text(max_size=3), st.lists(shapes, max_size=2).map(tuple), max_size=2), max_size=2
+    ),
+)
+NOT_SQUARE, NOT_FINITE, NOT_FLOAT = np.zeros((1, 2)), np.full((1, 1), np.inf), np.zeros((2, 2), np.float32)
+
+
+@given(nests)
+def test_arrays_survive_wherever_they_are(message: Nest):
+    assert codec.encode(codec.decode(Nest, codec.encode(message))) == codec.encode(message)
+
+
+@given(st.sampled_from([NOT_SQUARE, NOT_FINITE, NOT_FLOAT]), nests, st.integers(0, 2))
+def test_arrays_are_checked_wherever_they_are(wrong: np.ndarray, nest: Nest, number: int):
+    """At the publisher, and at the consumer of bytes that were not checked."""
+    first, flag = (np.eye(2),) * number, np.ones(1, bool)
+    places: dict[str, dict[str, object]] = {
+        "by_name['b']": {"by_name": {"a": np.eye(1), "b": wrong}},
+        "pair[1]": {"pair": (flag, wrong)},
+        f"many[{number}]": {"many": (*first, wrong)},
+        "many['a']": {"many": {"a": wrong}},
+        "either.sides": {"either": Cube(sides=wrong)},
+        f"deep[0]['a'][{number}].sides": {"deep": [{"a": (*(Ball(radii=flag) for _ in first), Cube(sides=wrong))}]},
+    }
+    for place, changes in places.items():
+        assert refused(msgspec.structs.replace(nest, **changes)).field == place
+
+
+def test_the_first_of_a_pair_is_not_what_the_second_is():
+    assert refused(Nest(pair=(np.eye(2), np.eye(2)))).field == "pair[0]"
+    assert refused(Nest(either=Ball(radii=np.eye(2)))).field == "either.radii"
+
+
+def refused(message: Message) -> CodecError:
+    with pytest.raises(CodecError) as caught:
+        codec.encode(message)
+    unchecked = msgspec.msgpack.Encoder(enc_hook=codec._to_wire).encode(message)
+    with pytest.raises(CodecError) as read:
+        codec.decode(type(message), unchecked)
+    assert (read.value.field, read.value.reason) == (caught.value.field, caught.value.reason)
+    return caught.value
+
+
+def test_what_a_publisher_gives_in_place_of_a_struct_or_tuple_is_checked_as_what_it_becomes():
+    with pytest.raises(CodecError, match="expected shape") as caught:
+        codec.encode(sample(things=[{"pose": np.zeros((1, 2))}]))
+    assert caught.value.field == "things[0].pose"
+
+
 def test_a_payload_over_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(codec, "MAX_BYTES", 10)
-    with pytest.raises(CodecError, match="more than the limit of 10"):
+    with pytest.raises(CodecError, match="11 bytes are more than the limit of 10"):
         codec.unpack(Envelope, bytes(11))
+
+
+@pytest.mark.parametrize("shape", [(300, 2**20, 3), (2**16, 2**17, 3)])
+def test_an_array_over_the_limit_is_refused_where_it_is_published(shape: tuple[int, ...]):
+    """Also one whose size msgpack cannot write."""
+    size = np.prod(shape)
+    with pytest.raises(CodecError, match=f"{size} bytes are more than the limit of {codec.MAX_BYTES}") as caught:
+        codec.encode(sample(image=np.broadcast_to(np.uint8(0), shape)))
+    assert (caught.value.type, caught.value.field) == ("Sample", "image")
+
+
+@given(samples, st.integers(-200, 200), st.sampled_from([0, codec.IN_PLACE_BYTES]))
+def test_what_is_published_is_what_can_be_read(message: Sample, room: int, in_place: int):
+    """The limit is that of the envelope, at both ends."""
+    whole = codec.pack(sealed(message))
+    with mock.patch.object(codec, "MAX_BYTES", len(whole) + room), mock.patch.object(codec, "IN_PLACE_BYTES", in_place):
+        try:
+            payload = codec.pack(sealed(message))
+        except CodecError as error:
+            assert room < 8 * 2 and "bytes are more than the limit" in error.reason  # lengths may be written longer
+            return
+        assert codec.open_envelope(Sample, codec.unpack(Envelope, payload)).scale == message.scale
+
+
+def test_a_record_over_the_limit_is_refused_where_it_is_published(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(codec, "MAX_BYTES", 100)
+    with pytest.raises(CodecError, match=r"LogLine: 1.. bytes are more than the limit of 100"):
+        codec.pack(LogLine("camera", 0, "info", "x" * 100, 0))
 
 
 def test_decoded_arrays_are_read_only():

@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 import yaml
 
 from runner.cli.main import main
-from runner.contract import Refused
+from runner.contract import Refused, Stage
 from runner.graph.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
-from tests.runner.toys import Add, Collect
+from tests.runner.toys import Add, Answer, Collect, Number, Piece
 
 HERE = Path(__file__).parent
 TOYS = HERE / "toys.yaml"
@@ -78,6 +79,21 @@ def test_a_good_graph_loads(tmp_path: Path):
         ("seed: 7", "tolerances: tests.runner.weather:MIGRATIONS", ":2: tolerances: .*; valid: Type.field"),
         ("seed: 7", "tolerances: tests.runnr.toys:TABLE", ":2: tolerances: no module 'tests.runnr.toys'"),
         ("seed: 7", "numerical: numpy", ":2: numerical: Expected `array`, got `str`"),
+        (
+            "answers: worker.answer",
+            "answers: {from: worker.answer, policy: latest}",
+            ":17: stages.gatherer.inputs.answers.policy: latest leaves messages out, but answers gathers .*: block",
+        ),
+        (
+            "answers: worker.answer, number: counter.number",
+            "answers: worker.answer, number: {from: counter.number, policy: latest}",
+            ":17: stages.gatherer.inputs.number.policy: latest .* on_answers joins number with answers.*valid: block",
+        ),
+        (
+            "queue: 8",
+            "policy: latest",
+            ":14: stages.worker.inputs.number.policy: latest .* on_piece joins number with piece",
+        ),
         ("  watcher:", "  supervisor:", ":23: stages.supervisor: a stage's name is .* none of supervisor"),
     ],
 )
@@ -85,6 +101,42 @@ def test_a_mistake_in_the_file_is_one_line(tmp_path: Path, old: str, new: str, m
     with pytest.raises(Refused, match=message) as caught:
         load(tmp_path, OUT, old=old, new=new)
     assert "\n" not in str(caught.value)
+
+
+class Alone(Stage):
+    """Answers each piece by itself."""
+
+    def on_piece(self, piece: Piece) -> Answer:
+        return Answer(index=piece.index, count=piece.count, samples=np.zeros(1))
+
+
+class Onlooker(Stage):
+    """Answers nothing."""
+
+    def on_piece(self, piece: Piece) -> Number | None:
+        del piece
+
+
+@pytest.mark.parametrize("replicas", [1, 2])
+def test_parts_that_are_answered_by_parts_are_all_needed(tmp_path: Path, replicas: int):
+    worker = TOYS.read_text().partition("  worker:\n")[2].partition("  gatherer:")[0]
+    alone = f"""    stage: tests.runner.test_graph:Alone
+    replicas: {replicas}
+    inputs: {{piece: {{from: splitter.piece, policy: latest}}}}
+"""
+    with pytest.raises(
+        Refused, match=r":12: stages.worker.inputs.piece.policy: latest .* each is to be answered.*block"
+    ):
+        load(tmp_path, OUT, old=worker, new=alone)
+
+
+def test_who_answers_no_parts_may_take_the_latest(tmp_path: Path):
+    onlooker = """  onlooker:
+    stage: tests.runner.test_graph:Onlooker
+    inputs: {piece: {from: splitter.piece, policy: latest}}
+"""
+    graph = load(tmp_path, OUT, old="  watcher:\n", new=f"{onlooker}  watcher:\n")
+    assert graph.nodes["onlooker"].inputs["piece"].policy == "latest"
 
 
 @pytest.mark.parametrize(

@@ -434,6 +434,7 @@ def test_the_doctor_finds_this_machine_fit_and_a_bad_graph() -> None:
         "limits",
     }
     assert [finding for finding in found if finding.judgement == "bad"] == []
+    assert not [finding for finding in found if "none known as tested" in finding.text]
     assert next(examine_graph(ACCOUNT)).judgement == "good"
     (bad,) = examine_graph(HERE / "absent.yaml")
     assert (bad.judgement, "absent.yaml" in bad.text) == ("bad", True)

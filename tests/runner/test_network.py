@@ -1,11 +1,13 @@
 """Hosts in graph files: what is read from them, what is refused as unsafe, and what never crosses."""
 
 import re
+import socket
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
+import psutil
 import pytest
 import zenoh
 
@@ -22,7 +24,6 @@ from tests.runner.machines import HOSTS, free_address
 from tests.runner.test_runs import DOUBLES, finish, read_until, start
 
 OUT = "sink.path=out.txt"
-LOOPBACK_HEX = "0100007F"
 LINE = "hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1, worker2: 127.0.0.1}"
 PLACED = "host: {worker1: 1, worker2: 1}"
 
@@ -230,10 +231,11 @@ def test_nothing_listens_where_others_could_call_unless_the_graph_says_so(tmp_pa
     opened = (f"listen=tcp/127.0.0.1:{port}",) if port else ()
     process = start(DOUBLES, tmp_path, *settings, *opened)
     before = read_until(process, "processes are ready")
-    addresses = {address for pid in descendants(process.pid) for address in listening(pid)}
+    runner = psutil.Process(process.pid)
+    addresses = [address for one in [runner, *runner.children(recursive=True)] for address in listening(one)]
     process.terminate()
     finish(process, tmp_path, before)
-    assert addresses == ({f"{LOOPBACK_HEX}:{int(port):04X}"} if port else set())
+    assert {(one.ip, one.port) for one in addresses} == ({("127.0.0.1", int(port))} if port else set())
 
 
 @pytest.mark.parametrize(
@@ -251,21 +253,7 @@ def test_where_others_listen_is_checked(value: str, reason: str):
         load_graph(DOUBLES, ("sink.path=x", f"listen={value}"))
 
 
-def descendants(pid: int) -> list[int]:
-    """A process and everything it has started."""
-    children = [
-        int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
-    ]
-    return [pid, *(one for child in children for one in descendants(child))]
-
-
-def listening(pid: int) -> set[str]:
-    """ADDRESS:PORT, in hex, of everything that a process would answer to: TCP listeners and bound UDP sockets."""
-    own = {str(path.readlink()) for path in Path(f"/proc/{pid}/fd").iterdir()}
-    found: set[str] = set()
-    for table, state in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
-        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if fields[3] == state and f"socket:[{fields[9]}]" in own:
-                found.add(fields[1])
-    return found
+def listening(process: psutil.Process) -> list[Any]:
+    """The addresses of everything that a process would answer to: TCP listeners and bound UDP sockets."""
+    sockets = process.net_connections("inet")
+    return [one.laddr for one in sockets if one.status == psutil.CONN_LISTEN or one.type == socket.SOCK_DGRAM]

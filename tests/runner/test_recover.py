@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 from mcap.reader import make_reader
 
@@ -163,15 +164,13 @@ def test_a_recorder_killed_at_any_moment_loses_half_a_second_at_most(tmp_path: P
     raise AssertionError(f"lost {lost} ns")
 
 
-def children(process: subprocess.Popen[str]) -> list[int]:
-    return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    return psutil.Process(process.pid).children()
 
 
 def recorder_of(process: subprocess.Popen[str]) -> int:
-    (pid,) = (
-        pid for pid in children(process) if b"runner.process.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
-    return pid
+    (recorder,) = (child for child in children(process) if "runner.process.recorder" in child.cmdline())
+    return recorder.pid
 
 
 def test_a_disk_that_is_full_slows_no_graph_and_is_its_exit_status(tmp_path: Path):
@@ -194,7 +193,7 @@ def wait_for_output(process: subprocess.Popen[str], folder: Path) -> None:
 
 
 def everything(process: subprocess.Popen[str]) -> None:
-    for pid in [process.pid, *children(process)]:
+    for pid in [process.pid, *(child.pid for child in children(process))]:
         os.kill(pid, signal.SIGKILL)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from runner.message.ids import MessageId
 from runner.process.children import DESCENT, Family
 from runner.recording.recording import Recording
 from tests.runner.machines import Party, on_loopback
@@ -188,7 +189,7 @@ def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
     recording = Recording(ended.recording)
     assert recording.verdict.complete
     seen = [id for step in recording.steps if step.stage == "glance" for _, id in step.consumed]
-    assert seen == sorted(seen, key=lambda id: int(id.partition("#")[2]))
+    assert seen == sorted(seen, key=MessageId.of)
 
 
 # ------------------------------------------------------------------------------------ shutdown

@@ -41,6 +41,13 @@ def add_file(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
 
 
+def count(text: str) -> int:
+    """Reads a number of things, for argparse."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
+    return int(text)
+
+
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Adds ``--set``, as ``settings``."""
     text = "change a setting, for example camera.dataset=DIR; may be given again"

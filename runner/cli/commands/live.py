@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from runner.cli import completion
-from runner.cli.commands import Commands, add
+from runner.cli.commands import Commands, add, count
 from runner.cli.completion import completed
 from runner.contract import Refused
+
+if TYPE_CHECKING:
+    from runner.live.live import Live
 
 
 def add_commands(commands: Commands) -> None:
@@ -53,12 +58,12 @@ def _add_topic(commands: Commands) -> None:
     _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
     echo = add(verbs, "echo", _topic_echo, "print messages as they come, whatever their type")
     completed(echo.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
-    echo.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many messages")
+    echo.add_argument("-n", type=count, metavar="N", dest="count", help="end after so many messages")
     _add_run(echo)
     for name, text in (("hz", "how often messages come"), ("bw", "how many bytes flow")):
         measure = add(verbs, name, _topic_rate, f"{text}, from their headers alone")
         completed(measure.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
-        measure.add_argument("-n", type=int, metavar="N", dest="count", help="end after so many lines, one a second")
+        measure.add_argument("-n", type=count, metavar="N", dest="count", help="end after so many lines, one a second")
         measure.set_defaults(measure=name)
         _add_run(measure)
 
@@ -96,53 +101,37 @@ def _logs(options: argparse.Namespace) -> int:
 
 
 def _topic_list(options: argparse.Namespace) -> int:
-    from runner.live.live import Live
     from runner.live.tables import topics_text
-    from runner.supervise.registry import find_run
 
-    with Live(find_run(options.run)) as live:
+    with _reached(options) as live:
         print(topics_text(live.status()))
     return 0
 
 
 def _topic_echo(options: argparse.Namespace) -> int:
     from runner.inspect.echo import lines_of
-    from runner.live.live import Live
-    from runner.supervise.registry import find_run
 
-    left = options.count
-    with Live(find_run(options.run)) as live:
-        for packet in live.messages(options.topic):
+    with _reached(options) as live:
+        for packet in islice(live.messages(options.topic), options.count):
             print("\n".join(lines_of(packet.payload)), flush=True)
-            left = None if left is None else left - 1
-            if left == 0:
-                break
     return 0
 
 
 def _topic_rate(options: argparse.Namespace) -> int:
-    from runner.live.live import Live
     from runner.live.tables import bandwidth_text, rate_text
-    from runner.supervise.registry import find_run
 
     text = rate_text if options.measure == "hz" else bandwidth_text
-    left = options.count
-    with Live(find_run(options.run)) as live:
-        for headers in live.headers(options.topic):
+    with _reached(options) as live:
+        for headers in islice(live.headers(options.topic), options.count):
             print(text(headers), flush=True)
-            left = None if left is None else left - 1
-            if left == 0:
-                break
     return 0
 
 
 def _call(options: argparse.Namespace) -> int:
-    from runner.live.live import Live
     from runner.live.tables import commands_text, show_progress
     from runner.supervise.calls import CallRequest
-    from runner.supervise.registry import find_run
 
-    with Live(find_run(options.run)) as live:
+    with _reached(options) as live:
         if options.name is None:
             print(commands_text(live.commands(), options.stage))
             return 0
@@ -160,22 +149,25 @@ def _field(text: str) -> tuple[str, str]:
 
 
 def _restart(options: argparse.Namespace) -> int:
-    from runner.live.live import Live
-    from runner.supervise.registry import find_run
-
-    with Live(find_run(options.run)) as live:
+    with _reached(options) as live:
         print(live.restart(options.process))
     return 0
 
 
 def _down(options: argparse.Namespace) -> int:
-    from runner.live.live import Live, wait_until_gone
+    from runner.live.live import wait_until_gone
     from runner.live.tables import from_here
+
+    with _reached(options) as live:
+        live.down()
+    wait_until_gone(live.entry)
+    print(f"{live.entry.run} has ended; recording {from_here(live.entry.recording)}")
+    return 0
+
+
+def _reached(options: argparse.Namespace) -> Live:
+    """The run that is named, or the only one."""
+    from runner.live.live import Live
     from runner.supervise.registry import find_run
 
-    entry = find_run(options.run)
-    with Live(entry) as live:
-        live.down()
-    wait_until_gone(entry)
-    print(f"{entry.run} has ended; recording {from_here(entry.recording)}")
-    return 0
+    return Live(find_run(options.run))

@@ -4,7 +4,7 @@ import argparse
 import os
 import subprocess
 
-from runner.cli.commands import Command, Commands, add, add_file, add_settings
+from runner.cli.commands import Command, Commands, add, add_file, add_settings, count
 from runner.contract import Refused
 
 _EPILOG = """\
@@ -26,24 +26,18 @@ def add_commands(commands: Commands) -> None:
     text = "execute this stage and what follows from it, changed or not; may be given again"
     replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
     replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
-    replay.add_argument("--workers", type=_count, metavar="N", help="stages executed at the same time (one a core)")
+    replay.add_argument("--workers", type=count, metavar="N", help="stages executed at the same time (one a core)")
     _add_travel(replay)
 
 
 def _add_travel(replay: argparse.ArgumentParser) -> None:
     replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
-    text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.weight < 0.5'"
+    text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.winner > 0'"
     replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
     replay.add_argument(
         "--step", action="store_true", help="go from message to message (Enter), from there or the start"
     )
     replay.add_argument("--prompt", action="store_true", help="open a Python prompt where it stops, terminal or not")
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
-    return int(text)
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -62,7 +56,7 @@ def _replay(options: argparse.Namespace) -> int:
 def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
     """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
     from runner.process.children import PARENT, die_with_parent
-    from runner.replay.workshop import clean_command, is_clean
+    from runner.replay.forks import clean_command, is_clean
 
     if is_clean():
         if PARENT in os.environ:

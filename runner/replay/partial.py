@@ -20,11 +20,12 @@ import msgspec
 
 from runner.contract import Refused
 from runner.graph.graph import Graph, Node
-from runner.message.codec import CodecError, Envelope, Step, pack, unpack
+from runner.message.codec import CodecError, Envelope, Step
+from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
-from runner.recording.recording import Recording, replicated, split_id
-from runner.replay.workshop import Forked
+from runner.recording.recording import Recording, replicated
+from runner.replay.forks import Forked
 
 AHEAD = 16
 """Recorded messages that are delivered while steps run; more would only wait in memory."""
@@ -36,20 +37,20 @@ class Request(msgspec.Struct, frozen=True):
     """A step that a stage's process is to take."""
 
     handler: str
-    inputs: tuple[tuple[str, bytes], ...]
-    """(port, envelope)."""
+    inputs: tuple[tuple[str, Envelope], ...]
+    """By port."""
     time_ns: int
 
 
 class Answer(msgspec.Struct, frozen=True):
     """What came of it."""
 
-    emitted: tuple[bytes, ...] = ()
+    emitted: tuple[Envelope, ...] = ()
     error: str = ""
     seconds: float = 0.0
 
 
-def host(node: Node, seed: int, directory: Path, connection: Connection) -> None:
+def serve(node: Node, seed: int, directory: Path, connection: Connection) -> None:
     """Runs one stage in this process; every request on the connection is a step."""
     try:
         stage = node.construct()
@@ -65,12 +66,11 @@ def host(node: Node, seed: int, directory: Path, connection: Connection) -> None
 
 
 def _answer(node: Node, executor: Executor, request: Request) -> Answer:
-    began, emitted, error = time.perf_counter(), list[bytes](), ""
+    began, emitted, error = time.perf_counter(), list[Envelope](), ""
     handler = next(handler for handler in node.type.handlers if handler.name == request.handler)
     try:
-        ports = node.type.inputs
-        arrivals = [receive(ports[port], unpack(Envelope, data)) for port, data in request.inputs]
-        emitted += (pack(sealed) for sealed in executor.run(handler, arrivals, request.time_ns))
+        arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
+        emitted += executor.run(handler, arrivals, request.time_ns)
     except Exception as problem:
         error = f"{type(problem).__name__}: {problem}"
     return Answer(tuple(emitted), error, time.perf_counter() - began)
@@ -112,7 +112,7 @@ class _Stage:
         return self.ready.pop(key), self.idle.pop()
 
 
-class Cone:
+class PartialReplay:
     """The executed part of a graph, between what is recorded and what is compared."""
 
     def __init__(self, recording: Recording, graph: Graph, names: Collection[str], *, workers: int, folder: Path):
@@ -168,11 +168,11 @@ class Cone:
         if node.name not in replicated(self._recording.graph):
             return keys
         place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
-        return sorted(keys, key=lambda key: (split_id(key[2]), place.get(key[1], len(place)), key[3]))
+        return sorted(keys, key=lambda key: (MessageId.of(key[2]), place.get(key[1], len(place)), key[3]))
 
     def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
         log = folder / f"{node.name}-{len(self._forked)}.txt"
-        child = Forked(lambda connection: host(node, self._graph.seed, files, connection), log)
+        child = Forked(lambda connection: serve(node, self._graph.seed, files, connection), log)
         self._forked.append(child)
         return child
 
@@ -215,13 +215,13 @@ class Cone:
             self._dispatch(self._stages[key[0]], key)
         return bool(keys)
 
-    def _rank(self, key: Key) -> tuple[int, tuple[str, int], Key]:
+    def _rank(self, key: Key) -> tuple[int, MessageId, Key]:
         """Where a step stands in the recording; new ones come last, by lineage."""
-        return self._ranks.get(key, len(self._ranks)), split_id(key[2]), key
+        return self._ranks.get(key, len(self._ranks)), MessageId.of(key[2]), key
 
     def _dispatch(self, stage: _Stage, key: Key) -> None:
         ready, child = stage.take(key)
-        inputs = tuple((arrival.port.name, pack(arrival.envelope)) for arrival in ready.arrivals)
+        inputs = tuple((arrival.port.name, arrival.envelope) for arrival in ready.arrivals)
         time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
         child.connection.send_bytes(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
         self._running[child.connection] = (stage, key, child)
@@ -238,8 +238,7 @@ class Cone:
         self.seconds += answer.seconds
         if answer.error:
             self.errors.append(f"{_step_name(key)}: {answer.error}")
-        for data in answer.emitted:
-            sealed = unpack(Envelope, data)
+        for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
             self._frozen.came(sealed.id)
             self._deliver(sealed, recorded=False)
@@ -253,10 +252,10 @@ class Cone:
         return sealed is not None
 
     def _deliver(self, sealed: Envelope, *, recorded: bool) -> None:
-        source, _, port = split_id(sealed.id)[0].partition(".")
-        for route in self._graph.routes(source):
+        id = MessageId.of(sealed.id)
+        for route in self._graph.routes(id.stage):
             stage = self._stages.get(route.consumer)
-            if route.output != port or stage is None:
+            if route.output != id.port or stage is None:
                 continue
             if recorded and route.policy == "latest" and (route.consumer, route.input, sealed.id) not in self._consumed:
                 continue  # a newer one replaced it
@@ -279,7 +278,7 @@ class _Frozen:
         self._recording = recording
         self._came: set[str] = set()
         self._positions = {id: position for position, id in enumerate(recording.messages)}
-        frozen = (id for id in recording.messages if id.partition(".")[0] not in names)
+        frozen = (id for id in recording.messages if MessageId.of(id).stage not in names)
         self._free = [(self._positions[id], id) for id in frozen]
         """A heap: what may come, oldest first."""
         self._waiting: dict[str, list[str]] = defaultdict(list)

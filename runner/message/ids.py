@@ -1,0 +1,48 @@
+"""The id of a message: ``stage.port#sequence``, plain text on the wire and in recordings."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+IdText = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$(?!\n)")]
+
+
+class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
+    """The parts of an id, in the order by which ids are sorted."""
+
+    stage: str
+    port: str
+    sequence: int
+
+    @staticmethod
+    def of(text: str) -> MessageId:
+        """Reads an id; a part that is missing or malformed is empty, a sequence 0."""
+        source, _, sequence = text.partition("#")
+        stage, _, port = source.partition(".")
+        return MessageId(stage, port, int(sequence) if sequence.isdecimal() and len(sequence) <= 15 else 0)
+
+    @property
+    def topic(self) -> str:
+        """What its port is recorded under: ``stage/port``."""
+        return f"{self.stage}/{self.port}"
+
+    def __str__(self) -> str:
+        return f"{self.stage}.{self.port}#{self.sequence}"
+
+
+def split_id(id: str) -> tuple[str, int]:
+    """``stage.port`` and sequence."""
+    one = MessageId.of(id)
+    return f"{one.stage}.{one.port}", one.sequence
+
+
+def topic_of(id: str) -> str:
+    """``stage/port``."""
+    return MessageId.of(id).topic
+
+
+def sequence_of(id: str) -> int:
+    """The number at the end."""
+    return MessageId.of(id).sequence
