@@ -94,7 +94,7 @@ def test_latency_by_edge_stage_and_lineage(toys: Path):
 
 def test_a_recording_of_nothing_has_no_latency(tmp_path: Path):
     path, _ = record_toys(tmp_path, keep=lambda _: None)
-    assert latency(path) == [f"{path}: COMPLETE"]
+    assert latency(path) == [f"{path}: {Recording(path).verdict}"]
 
 
 # ------------------------------------------------------------------------------------ diff
