@@ -17,10 +17,11 @@ from runner.recording.intervals import Intervals
 Record = str | Step | Lost | LogLine
 """What is recorded; a message is its id."""
 MOST_NAMED = 100_000
-"""Ids of missing messages that are named, and records out of order: absurd numbers must not take all memory."""
+"""Ids of missing messages that are named: one with an absurd number must not take all memory."""
 MOST_RANGES = 2**15
 """Where a replicated stage leaves more parts than this unanswered, the oldest of them are settled."""
 FEW = 3
+"""Findings that are shown, and records that one finding names."""
 
 
 class _Input(msgspec.Struct, frozen=True):
@@ -89,6 +90,8 @@ class Proof:
         self._excused = defaultdict[str, Intervals](Intervals)
         """Recorded, and emitted by no step before a process of the stage was lost."""
         self._newest_ns = -1
+        self._misplaced = 0
+        """Records that do not follow the one before them in time, and the first of them:"""
         self._disorder: list[str] = []
         self._found = Counter[str]()
         self._dropped = Counter[str]()
@@ -97,9 +100,9 @@ class Proof:
 
     def enter(self, topic: str, log_time_ns: int, record: Record) -> None:
         """The next record of the file."""
-        self._found[topic] += 1
-        if log_time_ns <= self._newest_ns and len(self._disorder) < MOST_NAMED:
-            self._disorder.append(f"{_name(topic, record)} is out of order")
+        if log_time_ns <= self._newest_ns:
+            self._misplaced += 1
+            self._disorder += [_name(topic, record)] if self._misplaced <= FEW else []
         self._newest_ns = max(log_time_ns, self._newest_ns)
         match record:
             case str():
@@ -110,10 +113,10 @@ class Proof:
                 self.lost(record)
             case LogLine():
                 pass
+        self._found[topic] += 1
 
     def drop(self, topic: str, record: Record) -> None:
         """A record that came and is not in the file."""
-        self._dropped[topic] += 1
         match record:
             case str():
                 self.want(record)
@@ -124,6 +127,7 @@ class Proof:
                     self.want(id)
             case _:
                 pass
+        self._dropped[topic] += 1
 
     def want(self, id: str) -> None:
         """A message that should be recorded."""
@@ -207,12 +211,14 @@ class Proof:
 
     def problems(self, counts: Mapping[str, int] | None = None) -> Iterator[str]:
         """What else does not hold, a line each. ``counts`` of records by topic are those that came, unless given."""
-        yield from self._disorder
-        yield from self._process_problems()
         counts = self.counts if counts is None else counts
         for topic in sorted({*counts, *self._found}):
             if self._found[topic] != counts.get(topic, 0):
                 yield f"{topic} has {self._found[topic]} of {counts.get(topic, 0)} records"
+        if self._misplaced:
+            more = f" and {self._misplaced - FEW} more" if self._misplaced > FEW else ""
+            yield f"out of order: {', '.join(self._disorder)}{more}"
+        yield from self._process_problems()
         yield from self._message_problems()
 
     def _lacking(self, port: str) -> Intervals:

@@ -8,6 +8,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -136,8 +137,8 @@ class Recording:
         self._open: OrderedDict[int, dict[str, Envelope]] = OrderedDict()
         self._order: list[tuple[str, int, Record]] = []
         """Topic, log time and record of all entries in the order of the file."""
-        self._misplaced: list[str] = []
-        """Metadata that does not stand where it was written."""
+        self._misplaced: dict[str, None] = {}
+        """Findings: metadata that does not stand where it was written."""
         with open_file(path) as file:
             self._container = Container(file, str(path))
             for record in self._container:
@@ -193,7 +194,7 @@ class Recording:
         missing = proof.missing()
         if self._says_ends:
             counts = proof.counts if counts is None else counts
-            found = in_short([*self._misplaced, *proof.problems(counts)])
+            found = in_short(chain(proof.problems(counts), self._misplaced))
         complete = written.get("verdict") == "COMPLETE" and not (self._breakage or found or missing)
         reasons = (reason, "" if found in reason else found)
         return Verdict(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
@@ -230,8 +231,8 @@ class Recording:
         return (self.envelope(id) for id in self.messages)
 
     def _forget(self) -> None:
-        lists = (self.steps, self.log, self.lost, self._order, self._misplaced)
-        for entered in (self.metadata, self.messages, self.repeated, *lists):
+        lists = self.steps, self.log, self.lost, self._order
+        for entered in (self.metadata, self._misplaced, self.messages, self.repeated, *lists):
             entered.clear()
 
     def _enter(self, record: Metadata | Entry) -> None:
@@ -245,9 +246,9 @@ class Recording:
 
     def _enter_metadata(self, record: Metadata) -> None:
         if record.name in self.metadata:
-            self._misplaced.append(f"metadata {record.name!r} stands there twice")
+            self._misplaced[f"metadata {record.name!r} stands there again"] = None
         if record.name == RUN and self._order:
-            self._misplaced.append(f"metadata {RUN!r} does not stand first")
+            self._misplaced[f"metadata {RUN!r} does not stand first"] = None
         self.metadata[record.name] = record.metadata
 
     def _enter_entry(self, entry: Entry) -> None:
@@ -264,8 +265,8 @@ class Recording:
                 self.repeated[id] += id in self.messages
                 where = entry.log_time_ns, len(entry.data), entry.offset
                 self.messages.setdefault(id, Located(id, record.lineage, entry.topic, record.type, *where))
-        if VERDICT in self.metadata and not self._misplaced:
-            self._misplaced.append(f"metadata {VERDICT!r} does not stand last")
+        if VERDICT in self.metadata:
+            self._misplaced[f"metadata {VERDICT!r} does not stand last"] = None
         self._order.append((entry.topic, entry.log_time_ns, record.id if isinstance(record, Envelope) else record))
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:

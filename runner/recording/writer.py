@@ -272,8 +272,8 @@ class RecordingWriter:
         found = list(self._read_back(end))
         with self._proving:
             for topic, log_time_ns, record in found:
-                self._unproved.pop(log_time_ns, None)
                 self._proof.enter(topic, log_time_ns, record)
+                self._unproved.pop(log_time_ns, None)
         self._problems += [f"read back: {damage}" for damage in self._container.damage[known:]]
         self._drop_unproved()
         self._proved = end

@@ -129,6 +129,7 @@ def rewrite(
             data = change(channel.topic, message.data)
             times = (message.log_time, data, message.publish_time, message.sequence)
             writer.add_message(channels[channel.topic], *times)
+        writer.flush()
         for name, values in metadata.items():
             writer.add_metadata(name, values)
         writer.finish()
