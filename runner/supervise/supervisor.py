@@ -19,10 +19,10 @@ from runner.graph.graph import FINISHED, SUPERVISOR, Graph
 from runner.graph.placement import ALONE
 from runner.graph.ports import port_name
 from runner.hosts.head import Hosts
-from runner.inspect.info import stage_times
-from runner.inspect.skipped import skipped
+from runner.inspect.info import StageTimes
+from runner.inspect.skipped import Skipped
 from runner.message import codec
-from runner.message.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt, Step
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Pulse, Receipt
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals, admit, require_genuine
 from runner.process.delivery import Delivery
@@ -89,7 +89,7 @@ class Supervisor:
         self._stopping = threading.Event()
         self._delivery = Delivery(graph.routes(SUPERVISOR), self._bus.deliver, self._warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
-        self._steps: list[Step] = []
+        self._times, self._skipped = StageTimes(), Skipped(graph)
         self._refusals = Refusals(self._complain)
         self._guardian = Guardian(run, self._hosts, terminal, say=self._say, announce=self._publish_restart)
         self._numbers: dict[str, int] = defaultdict(int)
@@ -150,7 +150,8 @@ class Supervisor:
         journal = self._refusals.read(Journal, packet)
         for step in journal.steps if journal is not None else ():
             self._guardian.note_step(step)
-            self._steps.append(step)
+            self._times.note(step)
+            self._skipped.note(step)
             if step.outcome == "done":
                 self._delivery.acknowledge(step.stage, step.consumed)
                 self._calls.note_step(step)
@@ -224,8 +225,8 @@ class Supervisor:
         return verdict
 
     def _conclude(self, end: End, verdict: str) -> End:
-        if self._steps:
-            self._terminal.plain("", *stage_times(self._steps), *skipped(self._graph, self._steps), "")
+        if times := self._times.lines():
+            self._terminal.plain("", *times, *self._skipped.lines(), "")
         self._terminal.plain(f"recording {verdict}")
         return end if self._guardian.complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
 

@@ -27,7 +27,7 @@ from runner.graph.graph import Graph, graph_from_json, node_entry
 from runner.message.codec import CodecError, Envelope, open_envelope, unpack
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
-from runner.recording.recording import JOURNAL, LOG, RUN, Recording, split_id
+from runner.recording.recording import RUN, Recording, payload_kind, split_id
 from runner.view.canvas import Canvas
 from runner.view.drawing import Drawing, Views
 
@@ -156,7 +156,7 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
 
 
 def _draw_entry(show: Show, entry: Entry) -> None:
-    if not entry.topic.startswith((JOURNAL, LOG)):
+    if payload_kind(entry.topic) is Envelope:
         with contextlib.suppress(CodecError):
             show.draw(unpack(Envelope, entry.data))
 

@@ -31,13 +31,13 @@ def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manife
 
 
 def record_toys(
-    folder: Path, *settings: str, keep: Keep = lambda record: record, log: Iterable[LogLine] = ()
+    folder: Path, *settings: str, keep: Keep = lambda record: record, more: Iterable[Recorded] = ()
 ) -> tuple[Path, Verdict]:
-    """Runs the toy graph in this process and records what ``keep`` lets through."""
+    """Runs the toy graph in this process and records what ``keep`` lets through, and ``more``."""
     settings = (f"sink.path={folder / 'out.txt'}", *settings)
     graph = load_graph(TOYS, settings)
     kept = filter(None, map(keep, ToyRun(graph, folder).records()))
-    return record(graph, folder / "toys.mcap", [*kept, *log], settings)
+    return record(graph, folder / "toys.mcap", [*kept, *more], settings)
 
 
 def record(
