@@ -81,14 +81,17 @@ class Durations:
 
     @property
     def median(self) -> float:
-        """Half are shorter; 0 where there is none."""
-        half = sum(number for number, _ in self._like.values()) / 2
-        before = 0
+        """The middle one, or the mean of the two in the middle; there must be one."""
+        count = sum(number for number, _ in self._like.values())
+        return (self._at((count - 1) // 2) + self._at(count // 2)) / 2
+
+    def _at(self, place: int) -> float:
+        """The one at a place in order of length, from 0."""
         for _, (number, total) in sorted(self._like.items()):
-            before += number
-            if before >= half:
+            if place < number:
                 return total / number
-        return 0.0
+            place -= number
+        raise IndexError(place)
 
 
 class StageTimes:
