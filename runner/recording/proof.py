@@ -261,7 +261,7 @@ def in_short(problems: Iterable[str]) -> str:
     rest = iter(problems)
     first = list(itertools.islice(rest, FEW))
     more = sum(1 for _ in rest)
-    return "; ".join([*first, *([f"and {more} more findings"] if more else [])])
+    return "; ".join([*first, *([f"and {more} more"] if more else [])])
 
 
 def split_id(id: str) -> tuple[str, int]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import msgspec
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Message, Refused
@@ -47,6 +48,9 @@ BACKLOG_BYTES = 2**30
 """What may wait for the disk; beyond it payloads are dropped, counted, and the recording is INCOMPLETE."""
 CACHED_BYTES = 2**25
 """Newest part of a recording that the system keeps in memory, for those who read it as it grows."""
+
+
+Recorded = Envelope | Step | LogLine | Lost
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -136,7 +140,8 @@ class RecordingWriter:
         self._writer.flush()
         self._container = Container(self._file, str(self._path))
         """Knows the channels that have been read back."""
-        self._proved = self._file.tell()
+        self._proved = MAGIC_SIZE
+        """How much of the file has been."""
         self._channels: dict[str, int] = {}
         self._waiting: deque[_Payload | Callable[[], None]] = deque()
         self._counting = threading.Lock()
@@ -146,7 +151,8 @@ class RecordingWriter:
         self._chunk_bytes = 0
         self._log_time_ns = 0
         self._problems: list[str] = []
-        self._dropped = 0
+        self._overflowed = 0
+        """Payloads for which there was no room."""
         self._recorded = 0
         self._malformed = 0
         self._closing = threading.Event()
@@ -162,6 +168,7 @@ class RecordingWriter:
         payload = _Payload(kind, data, time.time_ns())
         with self._counting:
             if self._closed or self._waiting_bytes > BACKLOG_BYTES:
+                self._overflowed += not self._closed
                 self._drop(payload)
                 return
             self._waiting_bytes += len(data)
@@ -228,25 +235,32 @@ class RecordingWriter:
         return due
 
     def _write(self, payload: _Payload) -> None:
-        """Writes the first that waits."""
-        try:
-            record = unpack(payload.kind, payload.data)
-        except CodecError as error:
-            self._waiting.popleft()
-            self._malformed += 1
-            self._refuse(f"a malformed {payload.kind.__name__} was not recorded: {error}")
-            return
-        topic, named = _named(record)
-        self._log_time_ns = max(payload.received_ns, self._log_time_ns + 1)
-        self._unproved[self._log_time_ns] = topic, named
+        """Writes the first that waits. What fails on the way is among what waits or what is not proved yet."""
+        record = self._admit(payload)
+        if record is not None:
+            self._log_time_ns = max(payload.received_ns, self._log_time_ns + 1)
+            self._unproved[self._log_time_ns] = _named(record)
         self._waiting.popleft()
         with self._counting:
             self._waiting_bytes -= len(payload.data)
-        kind = record.type if isinstance(record, Envelope) else payload.kind.__name__
+        if record is not None:
+            self._add(record, payload.data)
+
+    def _admit(self, payload: _Payload) -> Recorded | None:
+        try:
+            return unpack(payload.kind, payload.data)
+        except CodecError as error:
+            self._malformed += 1
+            self._refuse(f"a malformed {payload.kind.__name__} was not recorded: {error}")
+            return None
+
+    def _add(self, record: Recorded, data: bytes | memoryview) -> None:
+        topic, _ = _named(record)
+        kind = record.type if isinstance(record, Envelope) else type(record).__name__
         channel = self._channels.get(topic) or self._register(topic, kind)
         sequence = split_id(record.id)[1] if isinstance(record, Envelope) else getattr(record, "number", 0)
-        data = cast("bytes", payload.data)  # which need not be in one
-        self._writer.add_message(channel, self._log_time_ns, data, record.time_ns, sequence % 2**32)
+        whole = cast("bytes", data)  # which need not be in one
+        self._writer.add_message(channel, self._log_time_ns, whole, record.time_ns, sequence % 2**32)
         self._chunk_bytes += len(data)
         self._recorded += 1
 
@@ -268,13 +282,11 @@ class RecordingWriter:
 
     def _prove(self, end: int) -> None:
         """Reads back what was written since the last time; what is not there has been dropped."""
-        known = len(self._container.damage)
         found = list(self._read_back(end))
         with self._proving:
             for topic, log_time_ns, record in found:
                 self._proof.enter(topic, log_time_ns, record)
                 self._unproved.pop(log_time_ns, None)
-        self._problems += [f"read back: {damage}" for damage in self._container.damage[known:]]
         self._drop_unproved()
         self._proved = end
 
@@ -295,13 +307,12 @@ class RecordingWriter:
     def _verdict(self) -> Verdict:
         if self._steps_only:
             return Verdict(False, (), "; ".join([STEPS_ONLY, *self._problems]))
-        problems = list(self._problems)
-        reason = "" if self._problems else ": the disk was too slow"
-        problems += [f"{self._dropped} payloads dropped{reason}"] if self._dropped else []
+        overflow = f"{self._overflowed} payloads dropped: the disk was too slow" if self._overflowed else ""
+        unread = in_short(f"read back: {damage}" for damage in self._container.damage)
         with self._proving:
-            missing, counts = self._proof.missing(), self._proof.counts
-            problems += filter(None, [in_short(self._proof.problems())])
-        return Verdict(not missing and not problems, missing, "; ".join(problems), counts)
+            missing, counts, found = self._proof.missing(), self._proof.counts, in_short(self._proof.problems())
+        reason = "; ".join(filter(None, (*self._problems, overflow, unread, found)))
+        return Verdict(not missing and not reason, missing, reason, counts)
 
     # ------------------------------------------------------------------------------------ what is not recorded
 
@@ -315,9 +326,8 @@ class RecordingWriter:
 
     def _drop_unproved(self) -> None:
         with self._proving:
-            for topic, named in self._unproved.values():
-                self._dropped += 1
-                self._proof.drop(topic, named)
+            for topic, record in self._unproved.values():
+                self._proof.drop(topic, record)
         self._unproved.clear()
 
     def _drop_waiting(self) -> None:
@@ -335,11 +345,10 @@ class RecordingWriter:
         with contextlib.suppress(CodecError):
             topic, record = _named(unpack(payload.kind, payload.data))
             with self._proving:
-                self._dropped += 1
                 self._proof.drop(topic, record)
 
 
-def _named(record: Envelope | Step | LogLine | Lost) -> tuple[str, Record]:
+def _named(record: Recorded) -> tuple[str, Record]:
     """The topic of a record and what the proof knows it by."""
     match record:
         case Envelope(id=id):

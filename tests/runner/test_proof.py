@@ -202,7 +202,7 @@ def test_what_could_not_be_kept_is_missing():
 def test_the_first_few_findings_and_how_many_more():
     assert in_short([]) == ""
     assert in_short("abc") == "a; b; c"
-    assert in_short("abcde") == "a; b; c; and 2 more findings"
+    assert in_short("abcde") == "a; b; c; and 2 more"
 
 
 def test_absurd_numbers_take_no_memory():
