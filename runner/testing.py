@@ -22,9 +22,10 @@ from runner.graph.graph import QUEUE, Edge, Node
 from runner.graph.ports import StageType, inspect_stage, port_name
 from runner.message import codec
 from runner.message.codec import Envelope, open_envelope
+from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Ready
 from runner.process.step import Executor, Log, receive, step_time
-from runner.recording.recording import Recording, split_id, topic_of
+from runner.recording.recording import Recording
 
 M = TypeVar("M", bound=Message)
 Given = Message | Mapping[str, Message | Sequence[Message]]
@@ -66,8 +67,7 @@ def run_stage(
         emitted = (sealed for done in _steps(bench, given, times_ns) for sealed in done.emitted)
         outputs = bench.node.type.outputs
         messages = [
-            open_envelope(outputs[topic_of(sealed.id).partition("/")[2]], sealed)
-            for sealed in itertools.islice(emitted, limit)
+            open_envelope(outputs[MessageId.of(sealed.id).port], sealed) for sealed in itertools.islice(emitted, limit)
         ]
         bench.say_what_is_left()
         return messages
@@ -187,7 +187,7 @@ class Run:
         """Every recorded message of a class, by port and number."""
         recording = Recording(self.recording)
         ids = (id for id, message in recording.messages.items() if message.type == kind.__name__)
-        return [open_envelope(kind, recording.envelope(id)) for id in sorted(ids, key=split_id)]
+        return [open_envelope(kind, recording.envelope(id)) for id in sorted(ids, key=MessageId.of)]
 
 
 def run_graph(

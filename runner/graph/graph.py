@@ -25,7 +25,10 @@ K = TypeVar("K")
 MISSING = "???"
 """Stands in a graph file where the user must give a value with ``--set``."""
 SUPERVISOR = "supervisor"
-RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway")
+RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway", "journal", "log", "lost")
+"""Names that no stage may have: other processes, and topics of recordings."""
+READ_FROM_CLASSES = ("commands", "shares")
+"""Keys of a stage's entry that say what its class does, for those who read recordings without it."""
 SUPERVISOR_OUTPUTS: dict[str, type[Message]] = {port_name(Restarted): Restarted}
 FINISHED = port_name(Finished)
 RESTARTS = 3
@@ -301,7 +304,7 @@ def graph_to_json(graph: Graph) -> str:
 
 
 def node_entry(node: Node) -> dict[str, Any]:
-    """One stage as a graph file would state it, with every setting."""
+    """One stage as a graph file would state it, with every setting, its commands and the ports that replicas share."""
     return {
         "stage": node.stage,
         "config": {} if node.config is None else msgspec.to_builtins(node.config, enc_hook=str),
@@ -310,6 +313,8 @@ def node_entry(node: Node) -> dict[str, Any]:
             for port, edge in node.inputs.items()
             if port not in node.type.commands
         },
+        "commands": list(node.type.commands),
+        "shares": [port for port in node.inputs if node.shares(port)],
         "replicas": node.replicas,
         **({"host": dict(Counter(node.placement))} if node.placement else {}),
         "restarts": node.restarts,
@@ -322,7 +327,7 @@ def node_entry(node: Node) -> dict[str, Any]:
 
 def node_from_entry(name: str, entry: dict[str, Any]) -> Node:
     """Reads back what :func:`node_entry` wrote, without the rest of the graph and so without importing it."""
-    document = Document(name, Path.cwd(), {"stages": {name: _unplaced(entry)}})
+    document = Document(name, Path.cwd(), {"stages": {name: _stated(entry)}})
     read = _read_entry(document, name)
     kind = _load(document, name, read)
     _absolute_paths(document, {name: read}, {name: kind})
@@ -333,13 +338,14 @@ def graph_from_json(text: str, label: str = "graph") -> Graph:
     """Reads back what :func:`graph_to_json` wrote, for this machine alone; ``label`` names it in errors."""
     values = {key: value for key, value in json.loads(text).items() if key not in ("hosts", "keys", "router", "listen")}
     if isinstance(values.get("stages"), dict):
-        values["stages"] = {name: _unplaced(entry) for name, entry in values["stages"].items()}
+        values["stages"] = {name: _stated(entry) for name, entry in values["stages"].items()}
     return _build(Document(label, Path.cwd(), values))
 
 
-def _unplaced(entry: Any) -> Any:
-    """A stage's entry without its host: what is read back runs where it is read."""
-    return {key: value for key, value in entry.items() if key != "host"} if isinstance(entry, dict) else entry
+def _stated(entry: Any) -> Any:
+    """What a graph file states of a stage, without its host: what is read back runs where it is read."""
+    left_out = ("host", *READ_FROM_CLASSES)
+    return {key: value for key, value in entry.items() if key not in left_out} if isinstance(entry, dict) else entry
 
 
 def _build(document: Document) -> Graph:

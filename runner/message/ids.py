@@ -30,19 +30,3 @@ class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
 
     def __str__(self) -> str:
         return f"{self.stage}.{self.port}#{self.sequence}"
-
-
-def split_id(id: str) -> tuple[str, int]:
-    """``stage.port`` and sequence."""
-    one = MessageId.of(id)
-    return f"{one.stage}.{one.port}", one.sequence
-
-
-def topic_of(id: str) -> str:
-    """``stage/port``."""
-    return MessageId.of(id).topic
-
-
-def sequence_of(id: str) -> int:
-    """The number at the end."""
-    return MessageId.of(id).sequence

@@ -106,7 +106,7 @@ class Recorder:
         deadline = time.monotonic() + ORPHANED_SECONDS
         while self._present and time.monotonic() < deadline:
             time.sleep(TICK_SECONDS / 5)
-        self._writer.lament("the supervisor died")
+        self._writer.note_problem("the supervisor died")
 
     def _vitals(self) -> dict[str, Any]:
         vitals = self._writer.vitals()

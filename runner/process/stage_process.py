@@ -23,6 +23,7 @@ from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.message import codec
 from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, LogLine, Lost, Outcome, Step, answered
+from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, explain_death, volunteer_for_oom
@@ -331,7 +332,7 @@ class StageProcess:
     def _emit(self, draft: Draft) -> None:
         """Sends a message once its consumers have room; also where the graph ends meanwhile."""
         envelope, payload = draft.cover, b"".join(draft.parts())
-        port = envelope.id.partition("#")[0].rpartition(".")[2]
+        port = MessageId.of(envelope.id).port
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
 

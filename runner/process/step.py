@@ -15,7 +15,6 @@ from runner.graph.ports import Handler, InputPort, port_name
 from runner.message import codec
 from runner.message.codec import Draft, Envelope
 from runner.message.ids import MessageId
-from runner.message.ids import sequence_of as sequence_of  # noqa: PLC0414 - for its importers
 
 Log = Callable[[str, Level], None]
 """Takes one line of a stage's log."""

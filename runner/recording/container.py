@@ -104,11 +104,19 @@ class Container:
         self._stream, self.torn, self.unknown = file, True, 0
         return iter(self)
 
-    def entries_at(self, file: IO[bytes], offset: int) -> list[Entry]:
-        """The entries of one chunk that iterating has passed, read again from the same file."""
+    def entries_at(self, file: IO[bytes], offset: int, end: int | None = None) -> Iterator[Entry]:
+        """The entries between two places where records begin, by default those of one chunk; of the same file."""
         file.seek(offset)
-        record = next(_records(file, skip_magic=True))
-        return [entry for entry in self._entries(record, offset) if isinstance(entry, Entry)]
+        records = _records(file, skip_magic=True)
+        while (at := file.tell()) < (offset + 1 if end is None else end):
+            try:
+                record = next(records, None)
+            except _BROKEN as error:
+                self._note(at, _reason(error))
+                return
+            if record is None:
+                return
+            yield from (entry for entry in self._entries(record, at) if isinstance(entry, Entry))
 
     def _refuse_foreign(self, offset: int, error: Exception) -> None:
         if offset == 0 and self._stream.tell() <= 8:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,11 +16,11 @@ import msgspec
 from mcap.records import Channel, Metadata, Schema
 
 from runner.contract import Refused
+from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
-from runner.message.ids import split_id
-from runner.message.ids import topic_of as topic_of  # noqa: PLC0414 - for its importers
 from runner.recording.container import Container, Damage, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
+from runner.recording.proof import Proof, Record, in_short
 from runner.recording.provenance import fingerprint, numerical
 
 T = TypeVar("T")
@@ -27,24 +28,25 @@ PROFILE = "scene-programming"
 """Of the MCAP header."""
 JOURNAL = "journal/"
 LOG = "log/"
+LOST = "lost/"
 RUN = "run"
 """Name of the metadata that says what ran where."""
+FORMAT = "2"
+"""Of recordings, under ``format`` in that metadata: the first said neither how processes ended nor what it counted."""
 VERDICT = "verdict"
 STEPS_ONLY = "steps only"
 """Of a run that was asked to record no messages."""
-MOST_GAPS = 100_000
-"""Ids named where sequences have gaps: one that claims an absurd number must not take all memory."""
 OPEN_CHUNKS = 8
 """Decompressed chunks kept in memory while messages are looked up by id."""
 
 
-def payload_kind(topic: str) -> type[Envelope] | type[Step] | type[LogLine] | type[Lost]:
+Kind = type[Envelope] | type[Step] | type[LogLine] | type[Lost]
+
+
+def payload_kind(topic: str) -> Kind:
     """What is recorded under a topic."""
-    if topic.startswith("lost/"):
-        return Lost
-    if topic.startswith(JOURNAL):
-        return Step
-    return LogLine if topic.startswith(LOG) else Envelope
+    kinds: dict[str, Kind] = {JOURNAL: Step, LOG: LogLine, LOST: Lost}
+    return kinds.get(topic[: topic.find("/") + 1], Envelope)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,9 @@ class Verdict:
     missing: tuple[str, ...] = ()
     """Ids of messages that the journal or a gap in a port's sequence names and that are not recorded."""
     reason: str = ""
+    """What else does not hold: the first few findings and how many more there are."""
+    counts: Mapping[str, int] | None = field(default=None, compare=False)
+    """Records that came, by topic; None where nobody counted them."""
 
     @property
     def word(self) -> str:
@@ -77,7 +82,8 @@ class Verdict:
 
     def metadata(self) -> dict[str, str]:
         """As it stands in a file."""
-        return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason}
+        counts = {} if self.counts is None else {"counts": json.dumps(self.counts)}
+        return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason, **counts}
 
     def __str__(self) -> str:
         more = f" and {len(self.missing) - 5} more" if len(self.missing) > 5 else ""
@@ -86,58 +92,17 @@ class Verdict:
         return f"{self.word}: {'; '.join(reasons)}" if reasons else self.word
 
 
-class Ledger:
-    """Keeps the accounts of a recording: which ids it holds and which it should hold.
-
-    The sequence of every port starts at 0 and has no gaps, except where replicas share the numbering:
-    a replica that was stopped leaves its number unused. Whatever a step consumed or emitted is recorded.
-    """
-
-    def __init__(self, shared_numbering: frozenset[str] = frozenset()) -> None:
-        """``shared_numbering`` names the stages that run as replicas."""
-        self._shared = shared_numbering
-        self._recorded: set[str] = set()
-        self._named: set[str] = set()
-        self._last: dict[str, int] = {}
-
-    def message(self, id: str) -> None:
-        """Enters a recorded message."""
-        self._recorded.add(id)
-        port, sequence = split_id(id)
-        self._last[port] = max(self._last.get(port, 0), sequence)
-
-    def step(self, step: Step) -> None:
-        """Enters a journalled step."""
-        self._named.update(id for _, id in step.consumed)
-        self._named.update(step.emitted)
-
-    def lost(self, id: str) -> None:
-        """Enters a message that came and could not be kept."""
-        self._recorded.discard(id)
-        self._named.add(id)
-
-    def missing(self) -> tuple[str, ...]:
-        """Ids that should be there and are not, by port and sequence."""
-        gaps = set(itertools.islice(self._gaps(), MOST_GAPS))
-        return tuple(sorted((self._named - self._recorded) | gaps, key=split_id))
-
-    def _gaps(self) -> Iterator[str]:
-        ports = (port for port in self._last if port.partition(".")[0] not in self._shared)
-        numbered = (f"{port}#{sequence}" for port in ports for sequence in range(self._last[port]))
-        return (id for id in numbered if id not in self._recorded)
-
-
 def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     """The stages of a graph, as recorded, that run as replicas."""
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
 
 
-def _ids(text: str) -> list[str]:
-    """A JSON list of ids; nothing where the text is none."""
+def _decoded(text: str, default: T) -> T:
+    """What a JSON text holds; the default where it is none or of another type."""
     try:
-        return msgspec.json.decode(text, type=list[str])
+        return msgspec.json.decode(text, type=type(default))
     except msgspec.MsgspecError:
-        return []
+        return default
 
 
 def _readable(entry: Entry) -> bool:
@@ -157,10 +122,17 @@ class Recording:
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages: dict[str, Located] = {}
         self.steps: list[Step] = []
+        """What handlers did; not that a process ended, nor what the supervisor sent."""
         self.log: list[LogLine] = []
+        self.lost: list[Lost] = []
+        """Processes that died."""
         self.repeated: Counter[str] = Counter()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
         self._open: OrderedDict[int, dict[str, Envelope]] = OrderedDict()
+        self._order: list[tuple[str, int, Record]] = []
+        """Topic, log time and record of all entries in the order of the file."""
+        self._misplaced: dict[str, None] = {}
+        """Findings: metadata that does not stand where it was written."""
         with open_file(path) as file:
             self._container = Container(file, str(path))
             for record in self._container:
@@ -205,16 +177,22 @@ class Recording:
         """True where the end of the file is missing."""
         return self._container.torn
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
-        """What the recorder concluded; where the file is torn or damaged since, what its content says."""
-        missing = self._missing()
+        """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
-        if self.torn:
-            return Verdict(False, missing, f"torn at {self.damage[-1]}")
-        if self.damage:
-            return Verdict(False, missing, f"damaged at {self.damage[0]}")
-        return Verdict(written.get("verdict") == "COMPLETE" and not missing, missing, written.get("reason", ""))
+        counts = _decoded(written.get("counts", ""), dict[str, int]()) if VERDICT in self.metadata else None
+        reason = self._breakage or written.get("reason", "")
+        if self._steps_only:
+            return Verdict(False, (), reason, counts)
+        proof, found = self._prove(), ""
+        missing = proof.missing()
+        if self._says_ends:
+            counts = proof.counts if counts is None else counts
+            found = in_short(chain(proof.problems(counts), self._misplaced))
+        complete = written.get("verdict") == "COMPLETE" and not (self._breakage or found or missing)
+        reasons = (reason, "" if found in reason else found)
+        return Verdict(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
 
     @property
     def channels(self) -> Mapping[int, Channel]:
@@ -254,41 +232,52 @@ class Recording:
         return (self.envelope(id) for id in self.messages)
 
     def _forget(self) -> None:
-        for entered in (self.messages, self.steps, self.log, self.repeated):
+        lists = self.steps, self.log, self.lost, self._order
+        for entered in (self.metadata, self._misplaced, self.messages, self.repeated, *lists):
             entered.clear()
 
     def _enter(self, record: Metadata | Entry) -> None:
         if isinstance(record, Metadata):
-            self.metadata[record.name] = record.metadata
+            self._enter_metadata(record)
             return
         try:
             self._enter_entry(record)
         except CodecError as error:
             self.damage.append(Damage(record.offset, f"a record of {record.topic}: {error}"))
 
+    def _enter_metadata(self, record: Metadata) -> None:
+        if record.name in self.metadata:
+            self._misplaced[f"metadata {record.name!r} stands there again"] = None
+        if record.name == RUN and self._order:
+            self._misplaced[f"metadata {RUN!r} does not stand first"] = None
+        self.metadata[record.name] = record.metadata
+
     def _enter_entry(self, entry: Entry) -> None:
-        match unpack(payload_kind(entry.topic), entry.data):
-            case Step() as step:
-                if step.handler:
-                    self.steps.append(step)
-            case LogLine() as line:
-                self.log.append(line)
+        record = unpack(payload_kind(entry.topic), entry.data)
+        match record:
+            case Step():
+                if record.outcome != "ended" and record.stage != SUPERVISOR:
+                    self.steps.append(record)
+            case LogLine():
+                self.log.append(record)
             case Lost():
-                pass
-            case Envelope(id=id) as sealed:
+                self.lost.append(record)
+            case Envelope(id=id):
                 self.repeated[id] += id in self.messages
                 where = entry.log_time_ns, len(entry.data), entry.offset
-                self.messages.setdefault(id, Located(id, sealed.lineage, entry.topic, sealed.type, *where))
+                self.messages.setdefault(id, Located(id, record.lineage, entry.topic, record.type, *where))
+        if VERDICT in self.metadata:
+            self._misplaced[f"metadata {VERDICT!r} does not stand last"] = None
+        self._order.append((entry.topic, entry.log_time_ns, record.id if isinstance(record, Envelope) else record))
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:
         envelopes: dict[str, Envelope] = {}
         with open_file(self.path) as file:
-            entries = self._container.entries_at(file, offset)
-        for entry in entries:
-            if not entry.topic.startswith((JOURNAL, LOG, "lost/")):
-                with contextlib.suppress(CodecError):  # noted as damage when the file was read
-                    sealed = unpack(Envelope, entry.data)
-                    envelopes.setdefault(sealed.id, sealed)
+            for entry in self._container.entries_at(file, offset):
+                if payload_kind(entry.topic) is Envelope:
+                    with contextlib.suppress(CodecError):  # noted as damage when the file was read
+                        sealed = unpack(Envelope, entry.data)
+                        envelopes.setdefault(sealed.id, sealed)
         return envelopes
 
     def require_messages(self) -> None:
@@ -300,18 +289,26 @@ class Recording:
     def _steps_only(self) -> bool:
         return self.run.get("records") == STEPS_ONLY
 
-    def _missing(self) -> tuple[str, ...]:
-        """What the journal and the sequences name, and what the recorder could not keep."""
-        if self._steps_only:
-            return ()
-        ledger = Ledger(replicated(self.graph))
-        for id in _ids(self.metadata.get(VERDICT, {}).get("missing", "")):
-            ledger.lost(id)
-        for id in self.messages:
-            ledger.message(id)
-        for step in self.steps:
-            ledger.step(step)
-        return ledger.missing()
+    @property
+    def _breakage(self) -> str:
+        if self.torn:
+            return f"torn at {self.damage[-1]}"
+        return f"damaged at {self.damage[0]}" if self.damage else ""
+
+    @property
+    def _says_ends(self) -> bool:
+        """Whether it says how processes ended, which the first recordings did not."""
+        if "format" in self.run or "counts" in self.metadata.get(VERDICT, {}) or self.lost:
+            return True
+        return any(isinstance(record, Step) and record.outcome == "ended" for *_, record in self._order)
+
+    def _prove(self) -> Proof:
+        proof = Proof(self.graph)
+        for entry in self._order:
+            proof.enter(*entry)
+        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[str]()):
+            proof.want(id)
+        return proof
 
     def _read_graph(self) -> dict[str, Any]:
         if RUN not in self.metadata:
@@ -321,4 +318,8 @@ class Recording:
         stages = graph.get("stages")
         if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
             raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph")
+        try:
+            Proof(graph)
+        except msgspec.ValidationError as error:
+            raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph: {error}") from None
         return graph

@@ -5,22 +5,26 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import queue
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, cast
 
 import msgspec
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Message, Refused
 from runner.graph.graph import Destination
 from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
-from runner.recording.container import hold
+from runner.message.ids import MessageId
+from runner.recording.container import Container, hold
+from runner.recording.proof import Proof, Record, in_short
 from runner.recording.provenance import (
     file_hashes,
     fingerprint,
@@ -32,17 +36,17 @@ from runner.recording.provenance import (
     runner_version,
 )
 from runner.recording.recording import (
+    FORMAT,
     JOURNAL,
     LOG,
+    LOST,
     PROFILE,
     RUN,
     STEPS_ONLY,
     VERDICT,
-    Ledger,
+    Kind,
     Verdict,
-    replicated,
-    split_id,
-    topic_of,
+    payload_kind,
 )
 
 FLUSH_SECONDS = 0.25
@@ -55,7 +59,7 @@ BACKLOG_BYTES = 2**30
 CACHED_BYTES = 2**25
 """Newest part of a recording that the system keeps in memory, for those who read it as it grows."""
 
-Kind = type[Envelope] | type[Step] | type[LogLine] | type[Lost]
+Recorded = Envelope | Step | LogLine | Lost
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -99,6 +103,7 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
     graph = portable(json.loads(manifest.graph), Path.cwd())
     here, packages = machine(), package_versions()
     return {
+        "format": FORMAT,
         "graph": json.dumps(graph),
         "name": graph["name"],
         "seed": str(graph["seed"]),
@@ -122,7 +127,10 @@ class _Payload:
 
 
 class RecordingWriter:
-    """One recording being written. ``put`` hands over to the writer's thread and never waits for the disk."""
+    """One recording being written. ``put`` hands over to the writer's thread and never waits for the disk.
+
+    What the system has been handed is read back and proved from the file, see :mod:`runner.recording.proof`.
+    """
 
     def __init__(self, manifest: Manifest, refuse: Callable[[str], None]) -> None:
         """Creates the file with its metadata; raises Refused where that fails.
@@ -132,173 +140,139 @@ class RecordingWriter:
         self._refuse = refuse
         self._steps_only = manifest.steps_only
         self._topics = manifest.topics
-        self._file = _create(Path(manifest.path))
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self._path = Path(manifest.path)
+        self._proof = Proof(json.loads(manifest.graph))
+        self._proving = threading.Lock()
+        self._file = _create(self._path)
+        self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
         self._writer.start(profile=PROFILE)
         self._writer.add_metadata(RUN, run_metadata(manifest))
         self._writer.flush()
-        self._file.flush()
-        self._ledger = Ledger(replicated(json.loads(manifest.graph)))
+        self._container = Container(self._file, str(self._path))
+        """Knows the channels that have been read back."""
+        self._proved = MAGIC_SIZE
+        """How much of the file has been."""
         self._channels: dict[str, int] = {}
-        self._queue: queue.SimpleQueue[_Payload | Callable[[], None] | None] = queue.SimpleQueue()
+        self._waiting: deque[_Payload | Callable[[], None]] = deque()
         self._counting = threading.Lock()
         self._waiting_bytes = 0
-        self._end = self._file.tell()
-        self._unlooked = 0
-        """Bytes since it was last asked whether a chunk has closed."""
-        self._unflushed: list[str] = []
-        """Ids that the system does not have yet."""
+        self._unproved: dict[int, tuple[str, Record]] = {}
+        """Topic and record, by log time, of what has not been read back yet."""
+        self._chunk_bytes = 0
+        self._log_time_ns = 0
         self._problems: list[str] = []
-        self._dropped = 0
+        self._overflowed = 0
+        """Payloads for which there was no room."""
         self._recorded = 0
         self._malformed = 0
+        self._closing = threading.Event()
+        self._closed = False
+        """Whether the file takes no more."""
+        self._whole = False
+        """Whether the file has been written to its end."""
         self._thread = threading.Thread(target=self._write_all, name="recording", daemon=True)
         self._thread.start()
 
     def put(self, kind: Kind, data: bytes | memoryview) -> None:
         """Takes one payload as it came over the bus."""
+        payload = _Payload(kind, data, time.time_ns())
         with self._counting:
-            if self._waiting_bytes > BACKLOG_BYTES:
-                self._lose(kind, data)
+            if self._closed or self._waiting_bytes > BACKLOG_BYTES:
+                self._overflowed += not self._closed
+                self._drop(payload)
                 return
             self._waiting_bytes += len(data)
-            self._queue.put(_Payload(kind, data, time.time_ns()))
+            self._waiting.append(payload)
 
     def vitals(self) -> dict[str, Any]:
         """What the recorder's pulse says: records that are written, were refused and wait for the disk."""
         return {
-            "state": "working" if self._queue.qsize() else "waiting",
+            "state": "working" if self._waiting else "waiting",
             "steps": self._recorded,
             "refused": self._malformed,
-            "queued": {"disk": self._queue.qsize()},
+            "queued": {"disk": len(self._waiting)},
         }
 
     def after_flush(self, action: Callable[[], None]) -> None:
         """Acts, on the writer's thread, once everything that was put before can be read in the file."""
-        self._queue.put(action)
-        if not self._thread.is_alive():  # nothing more will be
-            action()
+        with self._counting:
+            if not self._closed:
+                self._waiting.append(action)
+                return
+        action()  # nothing more will be written
 
-    def lament(self, problem: str) -> None:
+    def note_problem(self, problem: str) -> None:
         """Has the verdict name a reason why not everything may be there."""
         self._problems.append(problem)
 
     def close(self) -> Verdict:
         """Writes what is waiting, the verdict and the end of the file."""
-        self._queue.put(None)
+        self._closing.set()
         self._thread.join()
-        return self._verdict()
+        verdict = self._verdict()
+        return verdict if self._whole else replace(verdict, complete=False)
+
+    # ------------------------------------------------------------------------------------ the writer's thread
 
     def _write_all(self) -> None:
         try:
-            self._write_payloads()
+            due = time.monotonic() + FLUSH_SECONDS
+            while not self._closing.wait(REST_SECONDS):
+                due = self._write_waiting(due)
+            self._write_waiting(due)
             self._write_verdict()
-        except OSError as error:
+        except BaseException as error:
             self._give_up(error)
         finally:
             with contextlib.suppress(OSError):
                 self._file.close()
+            self._drop_waiting()
 
-    def _give_up(self, error: OSError) -> None:
-        """Nothing can be written any more: what is waiting, and all that will still come, is named as missing."""
-        with self._counting:
-            self._waiting_bytes = BACKLOG_BYTES + 1
-            self._problems.append(f"writing failed: {error.strerror}")
-            for id in self._unflushed:
-                self._ledger.lost(id)
-            while not self._queue.empty():
-                payload = self._queue.get()
-                if isinstance(payload, _Payload):
-                    self._lose(payload.kind, payload.data)
-                elif payload is not None:
-                    payload()
-        self._refuse(f"recording ends here: {error.strerror}")
-
-    def _lose(self, kind: Kind, data: bytes | memoryview) -> None:
-        """Counts a payload that is not recorded, and names what it is or speaks of."""
-        self._dropped += 1
-        with contextlib.suppress(CodecError):
-            match unpack(kind, data):
-                case Envelope(id=id):
-                    self._ledger.lost(id)
-                case Step() as step:
-                    self._ledger.step(step)
-                case _:
-                    pass
-
-    def _write_payloads(self) -> None:
-        due = time.monotonic() + FLUSH_SECONDS
-        while self._write_waiting(due):
-            if time.monotonic() >= due:
+    def _write_waiting(self, due: float) -> float:
+        """Writes what waits, and closes a chunk when it is ``due``; returns when the next is."""
+        while self._waiting or time.monotonic() >= due:
+            if time.monotonic() >= due or self._chunk_bytes > CHUNK_BYTES:
                 self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
-            time.sleep(REST_SECONDS)
-
-    def _write_waiting(self, due: float) -> bool:
-        """Writes what waits until ``due``, when a chunk closes; waits for something. False at the end."""
-        with contextlib.suppress(queue.Empty):
-            payload = self._queue.get(timeout=max(0.0, due - time.monotonic()))
-            while payload is not None:
-                if isinstance(payload, _Payload):
-                    self._write(payload)
-                    self._hand_over_closed_chunk(len(payload.data))
-                else:
-                    self._flush()
-                    payload()
-                if time.monotonic() >= due:
-                    return True
-                payload = self._queue.get_nowait()
-            return False
-        return True
-
-    def _hand_over_closed_chunk(self, size: int) -> None:
-        """After some bytes more: a chunk closes by size too. Not after each few, for the system is asked."""
-        self._unlooked += size
-        if self._unlooked > CHUNK_BYTES // 8:
-            self._unlooked = 0
-            if self._file.tell() > self._end:
-                self._handed_over()
-
-    def _flush(self) -> None:
-        """Closes the chunk by time."""
-        self._writer.flush()
-        self._handed_over()
-
-    def _handed_over(self) -> None:
-        """Gives the system what closed chunks hold: a kill cannot take it back, also where a chunk closed by size."""
-        self._file.flush()
-        self._unflushed.clear()
-        self._end = self._file.tell()
-        # The system takes the memory of what is on the disk for what comes next; fresh memory costs thrice as much.
-        os.posix_fadvise(self._file.fileno(), 0, max(1, self._end - CACHED_BYTES), os.POSIX_FADV_DONTNEED)
+                continue
+            payload = self._waiting[0]
+            if isinstance(payload, _Payload):
+                self._write(payload)
+            else:
+                self._flush()
+                self._waiting.popleft()
+                payload()
+        return due
 
     def _write(self, payload: _Payload) -> None:
+        """Writes the first that waits. What fails on the way is among what waits or what is not proved yet."""
+        record = self._admit(payload)
+        if record is not None:
+            self._log_time_ns = max(payload.received_ns, self._log_time_ns + 1)
+            self._unproved[self._log_time_ns] = _named(record)
+        self._waiting.popleft()
         with self._counting:
             self._waiting_bytes -= len(payload.data)
+        if record is not None:
+            self._add(record, payload.data)
+
+    def _admit(self, payload: _Payload) -> Recorded | None:
         try:
-            record = unpack(payload.kind, payload.data)
+            return unpack(payload.kind, payload.data)
         except CodecError as error:
             self._malformed += 1
             self._refuse(f"a malformed {payload.kind.__name__} was not recorded: {error}")
-            return
-        match record:
-            case Envelope():
-                self._ledger.message(record.id)
-                self._unflushed.append(record.id)
-                self._add(topic_of(record.id), record.type, payload, record.time_ns, split_id(record.id)[1])
-            case Step():
-                self._ledger.step(record)
-                self._add(JOURNAL + record.stage, "Step", payload, record.time_ns, record.number)
-            case Lost():
-                self._add("lost/" + record.stage, "Lost", payload, record.time_ns, 0)
-            case LogLine():
-                self._add(LOG + record.stage, "LogLine", payload, record.time_ns, 0)
+            return None
 
-    def _add(self, topic: str, kind: str, payload: _Payload, time_ns: int, sequence: int) -> None:
-        self._recorded += 1
+    def _add(self, record: Recorded, data: bytes | memoryview) -> None:
+        topic, _ = _named(record)
+        kind = record.type if isinstance(record, Envelope) else type(record).__name__
         channel = self._channels.get(topic) or self._register(topic, kind)
-        data = cast("bytes", payload.data)  # which need not be in one
-        self._writer.add_message(channel, payload.received_ns, data, time_ns, sequence % 2**32)
+        sequence = MessageId.of(record.id).sequence if isinstance(record, Envelope) else getattr(record, "number", 0)
+        whole = cast("bytes", data)  # which need not be in one
+        self._writer.add_message(channel, self._log_time_ns, whole, record.time_ns, sequence % 2**32)
+        self._chunk_bytes += len(data)
+        self._recorded += 1
 
     def _register(self, topic: str, kind: str) -> int:
         known = self._topics.get(topic)
@@ -308,20 +282,93 @@ class RecordingWriter:
         self._channels[topic] = self._writer.register_channel(topic, "msgpack", schema_id, version)
         return self._channels[topic]
 
-    def _write_verdict(self) -> None:
-        verdict = self._verdict()
+    def _flush(self) -> None:
+        """Closes the chunk and gives it to the system: a kill cannot take it back. Then proves what is there."""
         self._writer.flush()
-        self._writer.add_metadata(VERDICT, verdict.metadata())
+        self._chunk_bytes = 0
+        self._prove(self._file.tell())
+        # The system takes the memory of what is on the disk for what comes next; fresh memory costs thrice as much.
+        os.posix_fadvise(self._file.fileno(), 0, max(1, self._proved - CACHED_BYTES), os.POSIX_FADV_DONTNEED)
+
+    def _prove(self, end: int) -> None:
+        """Reads back what was written since the last time; what is not there has been dropped."""
+        found = list(self._read_back(end))
+        with self._proving:
+            for topic, log_time_ns, record in found:
+                self._proof.enter(topic, log_time_ns, record)
+                self._unproved.pop(log_time_ns, None)
+        self._drop_unproved()
+        self._proved = end
+
+    def _read_back(self, end: int) -> Iterator[tuple[str, int, Record]]:
+        with self._path.open("rb") as file:
+            for entry in self._container.entries_at(file, self._proved, end):
+                with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
+                    yield entry.topic, entry.log_time_ns, _named(unpack(payload_kind(entry.topic), entry.data))[1]
+
+    def _write_verdict(self) -> None:
+        self._flush()
+        self._writer.add_metadata(VERDICT, self._verdict().metadata())
         self._writer.finish()
+        self._file.flush()
+        self._prove(self._file.tell())
+        self._whole = True
 
     def _verdict(self) -> Verdict:
         if self._steps_only:
             return Verdict(False, (), "; ".join([STEPS_ONLY, *self._problems]))
-        problems = list(self._problems)
-        reason = "" if self._problems else ": the disk was too slow"
-        problems += [f"{self._dropped} payloads dropped{reason}"] if self._dropped else []
-        missing = self._ledger.missing()
-        return Verdict(not missing and not problems, missing, "; ".join(problems))
+        overflow = f"{self._overflowed} payloads dropped: the disk was too slow" if self._overflowed else ""
+        unread = in_short(f"read back: {damage}" for damage in self._container.damage)
+        with self._proving:
+            missing, counts, found = self._proof.missing(), self._proof.counts, in_short(self._proof.problems())
+        reason = "; ".join(filter(None, (*self._problems, overflow, unread, found)))
+        return Verdict(not missing and not reason, missing, reason, counts)
+
+    # ------------------------------------------------------------------------------------ what is not recorded
+
+    def _give_up(self, error: BaseException) -> None:
+        """Nothing can be written any more: what is waiting, and all that will still come, is named as missing."""
+        strerror = error.strerror if isinstance(error, OSError) else None
+        reason = strerror or f"{type(error).__name__}: {error}".removesuffix(": ")
+        self._problems.append(f"writing failed: {reason}")
+        self._drop_unproved()
+        self._refuse(f"recording ends here: {reason}")
+
+    def _drop_unproved(self) -> None:
+        with self._proving:
+            for topic, record in self._unproved.values():
+                self._proof.drop(topic, record)
+        self._unproved.clear()
+
+    def _drop_waiting(self) -> None:
+        with self._counting:
+            self._closed = True
+        for payload in self._waiting:
+            if isinstance(payload, _Payload):
+                self._drop(payload)
+            else:
+                payload()
+        self._waiting.clear()
+
+    def _drop(self, payload: _Payload) -> None:
+        """Counts a payload that is not recorded, and names what it is or speaks of."""
+        with contextlib.suppress(CodecError):
+            topic, record = _named(unpack(payload.kind, payload.data))
+            with self._proving:
+                self._proof.drop(topic, record)
+
+
+def _named(record: Recorded) -> tuple[str, Record]:
+    """The topic of a record and what the proof knows it by."""
+    match record:
+        case Envelope(id=id):
+            return MessageId.of(id).topic, id
+        case Step():
+            return JOURNAL + record.stage, record
+        case Lost():
+            return LOST + record.stage, record
+        case LogLine():
+            return LOG + record.stage, record
 
 
 def _create(path: Path) -> IO[bytes]:
@@ -335,4 +382,4 @@ def _create(path: Path) -> IO[bytes]:
     return file
 
 
-_SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, Lost, LogLine)}
+_SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, LogLine, Lost)}

@@ -11,10 +11,10 @@ from pathlib import Path
 from runner.graph.graph import Limits
 from runner.hosts.head import RemoteChild
 from runner.message.codec import Pulse, Step, answered
+from runner.message.ids import MessageId
 from runner.message.packet import Process
 from runner.process.children import ending, last_lines, signal_group
 from runner.process.health import Watch, gigabytes, oom_kills
-from runner.process.step import sequence_of
 
 LOOK_SECONDS = 0.01
 REMEMBERED = 10_000
@@ -100,10 +100,10 @@ class Progress:
             return
         self.started |= not step.consumed
         for id in step.emitted:
-            port = id.partition("#")[0].rpartition(".")[2]
-            self.numbers[port] = max(self.numbers.get(port, 0), sequence_of(id) + 1)
+            one = MessageId.of(id)
+            self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
             for output, consumer, input in self._shared:
-                if output == port and not consumers[consumer].has_done(input, id):
+                if output == one.port and not consumers[consumer].has_done(input, id):
                     self.undone[consumer, input, id] = None
 
 

@@ -18,8 +18,8 @@ from runner.graph.graph import FINISHED, SUPERVISOR, Graph
 from runner.graph.placement import ALONE
 from runner.graph.ports import port_name
 from runner.hosts.head import Hosts
-from runner.inspect.info import stage_times
-from runner.inspect.skipped import skipped
+from runner.inspect.info import StageTimes
+from runner.inspect.skipped import Skipped
 from runner.message import codec
 from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
 from runner.message.packet import GATEWAY, Packet, Process
@@ -80,7 +80,7 @@ class Supervisor:
         self._stopping = threading.Event()
         self._delivery = Delivery(graph.routes(SUPERVISOR), self._give, self._warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
-        self._steps: list[Step] = []
+        self._times, self._skipped = StageTimes(), Skipped(graph)
         self._refusals = Refusals(self._complain)
         self._guardian = Guardian(
             run, self._hosts, terminal, say=self._say, announce=self._publish_restart, declare_lost=self._declare_lost
@@ -144,7 +144,8 @@ class Supervisor:
             self._delivery.answered(step.stage, answered(step))
             if step.stage in self._graph.nodes:
                 self._guardian.note_step(step)
-                self._steps.append(step)
+                self._times.note(step)
+                self._skipped.note(step)
                 self._calls.note_step(step)
             elif step.outcome == "ended":
                 self._has_ended.set()
@@ -237,8 +238,8 @@ class Supervisor:
         return verdict
 
     def _conclude(self, end: End, verdict: str) -> End:
-        if self._steps:
-            self._terminal.plain("", *stage_times(self._steps), *skipped(self._graph, self._steps), "")
+        if times := self._times.lines():
+            self._terminal.plain("", *times, *self._skipped.lines(), "")
         self._terminal.plain(f"recording {verdict}")
         return end if self._guardian.complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
 

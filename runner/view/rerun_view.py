@@ -25,7 +25,7 @@ from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
-from runner.recording.recording import JOURNAL, LOG, RUN, Recording
+from runner.recording.recording import RUN, Recording, payload_kind
 from runner.view.canvas import Canvas
 from runner.view.drawing import Views
 from runner.view.views import drawn, load_views
@@ -129,7 +129,7 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
 
 
 def _draw_entry(show: Show, entry: Entry) -> None:
-    if not entry.topic.startswith((JOURNAL, LOG)):
+    if payload_kind(entry.topic) is Envelope:
         with contextlib.suppress(CodecError):
             show.draw(unpack(Envelope, entry.data))
 

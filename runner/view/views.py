@@ -10,7 +10,7 @@ from typing import cast
 from runner.contract import Refused
 from runner.graph.graph import Graph, node_entry
 from runner.message.codec import Envelope, open_envelope
-from runner.recording.recording import split_id
+from runner.message.ids import MessageId
 from runner.view.drawing import Drawing, Views
 
 
@@ -22,10 +22,10 @@ def require_viewer() -> None:
 
 def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
     """What one message shows; what cannot be drawn is named on stderr and left out."""
-    stage, _, port = split_id(sealed.id)[0].partition(".")
+    id = MessageId.of(sealed.id)
     found: list[Drawing] = []
     try:
-        kind = graph.outputs_of(stage).get(port)
+        kind = graph.outputs_of(id.stage).get(id.port)
         if kind is not None:
             found.extend(views.draw(open_envelope(kind, sealed)))
     except Exception as error:  # the rest of the recording is still worth seeing

@@ -1,21 +1,26 @@
 """Makes recordings of the toy graph without processes: the same steps, journal and writer as in a run."""
 
-from collections import Counter, deque
+import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+import msgspec
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.graph.graph import Graph, graph_to_json, load_graph
-from runner.message.codec import Envelope, LogLine, Step, pack
+from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, load_graph
+from runner.message.codec import Envelope, LogLine, Lost, Step, pack
 from runner.message.ids import MessageId
+from runner.process.inbox import Inbox, Ready
+from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import RUN, Verdict
 from runner.recording.writer import Manifest, RecordingWriter, topic
-from runner.testing import Bench, Done
 
 TOYS = Path(__file__).with_name("toys.yaml")
 Keep = Callable[[Envelope | Step], Envelope | Step | None]
+Recorded = Envelope | Step | LogLine | Lost
 
 
 def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manifest:
@@ -26,48 +31,85 @@ def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manife
 
 
 def record_toys(
-    folder: Path, *settings: str, keep: Keep = lambda record: record, log: Iterable[LogLine] = ()
+    folder: Path, *settings: str, keep: Keep = lambda record: record, more: Iterable[Recorded] = ()
 ) -> tuple[Path, Verdict]:
-    """Runs the toy graph in this process and records what ``keep`` lets through."""
-    path = folder / "toys.mcap"
+    """Runs the toy graph in this process and records what ``keep`` lets through, and ``more``."""
     settings = (f"sink.path={folder / 'out.txt'}", *settings)
     graph = load_graph(TOYS, settings)
+    kept = filter(None, map(keep, ToyRun(graph, folder).records()))
+    return record(graph, folder / "toys.mcap", [*kept, *more], settings)
+
+
+def record(
+    graph: Graph, path: Path, records: Iterable[Recorded], settings: tuple[str, ...] = ()
+) -> tuple[Path, Verdict]:
+    """A recording of these records."""
     writer = RecordingWriter(manifest(graph, path, settings), print)
-    for record in _run(graph, folder):
-        kept = keep(record)
-        if kept is not None:
-            writer.put(type(kept), pack(kept))
-    for line in log:
-        writer.put(LogLine, pack(line))
+    for one in records:
+        writer.put(type(one), pack(one))
     return path, writer.close()
 
 
-def _run(graph: Graph, folder: Path) -> Iterator[Envelope | Step]:
-    """Steps every stage until nothing is left to do."""
-    benches = {
-        node.name: Bench(node, node.construct(), seed=graph.seed, directory=folder, log=lambda *_: None)
-        for node in graph.nodes.values()
-    }
-    numbers = Counter[str]()
-    sent: deque[Envelope] = deque()
+class ToyRun:
+    """Runs a graph in this process: the records of its processes, in an order in which they may come."""
 
-    def records(stage: str, steps: Iterable[Done]) -> Iterator[Envelope | Step]:
-        for done in steps:
-            sent.extend(done.emitted)
-            yield from done.emitted
-            consumed = tuple((arrival.port.name, arrival.envelope.id) for arrival in done.ready.arrivals)
-            emitted = tuple(sealed.id for sealed in done.emitted)
-            time_ns = done.emitted[0].time_ns if done.emitted else 0
-            yield Step(stage, 0, 0, numbers[stage], done.ready.handler.name, consumed, emitted, time_ns, 0, 0, 1000)
-            numbers[stage] += 1
+    def __init__(self, graph: Graph, folder: Path) -> None:
+        self._graph = graph
+        self._executors = {
+            node.name: Executor(node, node.construct(), seed=graph.seed, directory=folder, log=lambda *_: None)
+            for node in graph.nodes.values()
+        }
+        self._inboxes = {process: Inbox(graph.nodes[process[0]]) for process in graph.processes()}
+        self._numbers = dict.fromkeys([*graph.processes(), (SUPERVISOR, 0)], 0)
+        self._left = {process: dict[tuple[str, str], None]() for process in graph.processes()}
+        """What has arrived and was not consumed."""
+        self._sent: deque[Envelope] = deque()
 
-    for stage, bench in benches.items():
-        yield from records(stage, bench.advance())
-    while sent:
-        sealed = sent.popleft()
+    def records(self) -> Iterator[Envelope | Step]:
+        """Steps every process until nothing is left to do, and ends it."""
+        for node in self._graph.nodes.values():
+            if node.type.source is not None:
+                for draft in self._executors[node.name].advance(node.type.source, time.time_ns):
+                    yield from self._emitted((node.name, 0), "source", (), [draft.sealed()])
+        while self._sent:
+            yield from self._delivered(self._sent.popleft())
+        for process in self._numbers:
+            yield self._step(process, "", outcome="ended", left=tuple(self._left.get(process, ())))
+
+    def _delivered(self, sealed: Envelope) -> Iterator[Envelope | Step]:
+        """To one replica in turn where they share it, else to each."""
         id = MessageId.of(sealed.id)
-        for route in (route for route in graph.routes(id.stage) if route.output == id.port):
-            yield from records(route.consumer, benches[route.consumer].take(route.input, sealed))
+        for route in self._graph.routes(id.stage):
+            node = self._graph.nodes[route.consumer]
+            if route.output == id.port:
+                for replica in (id.sequence % node.replicas,) if route.shared else range(node.replicas):
+                    process = node.name, replica
+                    self._left[process][route.input, sealed.id] = None
+                    self._inboxes[process].add(receive(node.type.inputs[route.input], sealed))
+                    while ready := self._inboxes[process].pop():
+                        yield from self._worked_on(process, ready)
+
+    def _worked_on(self, process: tuple[str, int], ready: Ready) -> Iterator[Envelope | Step]:
+        node = self._graph.nodes[process[0]]
+        time_ns = step_time(node, ready.arrivals, time.time_ns())
+        out = list(self._executors[node.name].run(ready.handler, ready.arrivals, time_ns))
+        consumed = tuple((arrival.port.name, arrival.envelope.id) for arrival in ready.arrivals)
+        for one in consumed:
+            self._left[process].pop(one, None)
+        yield from self._emitted(process, ready.handler.name, consumed, out)
+
+    def _emitted(
+        self, process: tuple[str, int], handler: str, consumed: tuple[tuple[str, str], ...], out: list[Envelope]
+    ) -> Iterator[Envelope | Step]:
+        self._sent.extend(out)
+        ids = tuple(sealed.id for sealed in out)
+        time_ns = out[0].time_ns if out else 0
+        yield from [*out, self._step(process, handler, consumed=consumed, emitted=ids, time_ns=time_ns)]
+
+    def _step(self, process: tuple[str, int], handler: str, **fields: Any) -> Step:
+        number, self._numbers[process] = self._numbers[process], self._numbers[process] + 1
+        step = Step(*process, 0, number, handler, (), (), 0, 0, 0, 1000)
+        return msgspec.structs.replace(step, **fields)
 
 
 def rewrite(
@@ -78,9 +120,8 @@ def rewrite(
     with source.open("rb") as file, target.open("wb") as output:
         reader, writer = make_reader(file), Writer(output)
         writer.start()
-        for metadata in reader.iter_metadata():
-            changed = aspects or {} if metadata.name == RUN else {}
-            writer.add_metadata(metadata.name, {**metadata.metadata, **changed})
+        metadata = {found.name: found.metadata for found in reader.iter_metadata()}
+        writer.add_metadata(RUN, {**metadata.pop(RUN), **(aspects or {})})
         channels: dict[str, int] = {}
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if channel.topic not in channels:
@@ -88,5 +129,8 @@ def rewrite(
             data = change(channel.topic, message.data)
             times = (message.log_time, data, message.publish_time, message.sequence)
             writer.add_message(channels[channel.topic], *times)
+        writer.flush()
+        for name, values in metadata.items():
+            writer.add_metadata(name, values)
         writer.finish()
     return target

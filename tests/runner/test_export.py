@@ -26,7 +26,7 @@ VIEW = "view=tests.runner.toy_views:ToyViews"
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toys")
-    path, _ = record_toys(folder, VIEW, log=(LogLine("worker", 1, "warning", "slow", 10**18 + 7),))
+    path, _ = record_toys(folder, VIEW, more=(LogLine("worker", 1, "warning", "slow", 10**18 + 7),))
     assert main(["export", str(path), "--foxglove", str(folder / "foxglove.mcap")]) == 0
     return folder / "foxglove.mcap"
 

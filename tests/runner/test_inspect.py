@@ -1,17 +1,24 @@
 """Why, how long and what differs: the commands that look into a recording."""
 
+import random
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from runner.cli.main import main
 from runner.contract import Refused
+from runner.graph.graph import load_graph
 from runner.inspect.causes import Causes, path_to, tree
+from runner.inspect.info import Durations, StageTimes
 from runner.inspect.latency import critical_paths, latency
+from runner.inspect.skipped import Skipped
 from runner.message.codec import Envelope, Step
 from runner.recording.recording import Recording
-from tests.runner.recordings import record_toys
+from tests.runner.recordings import TOYS, record_toys
 
 MS = 1_000_000
 COSTS = {"splitter": (1, 2, 10), "worker": (3, 4, 50), "gatherer": (5, 6, 20), "sink": (7, 8, 30)}
@@ -94,7 +101,7 @@ def test_latency_by_edge_stage_and_lineage(toys: Path):
 
 def test_a_recording_of_nothing_has_no_latency(tmp_path: Path):
     path, _ = record_toys(tmp_path, keep=lambda _: None)
-    assert latency(path) == [f"{path}: COMPLETE"]
+    assert latency(path) == [f"{path}: {Recording(path).verdict}"]
 
 
 # ------------------------------------------------------------------------------------ diff
@@ -129,3 +136,47 @@ def test_a_message_that_one_recording_lacks(toys: Path, tmp_path: Path, capsys: 
     said = capsys.readouterr().out
     assert f"first difference: {lost}: only in {toys}" in said
     assert any(line.split() == ["gatherer/total", "1", "0"] for line in said.splitlines())
+
+
+# ------------------------------------------------------------------------------------ step by step
+
+
+@given(times=st.lists(st.integers(0, 10**12), min_size=1, max_size=200))
+def test_durations_in_little_memory_are_as_good_as_exact(times: list[int]):
+    durations = Durations()
+    for one in times:
+        durations.note(one)
+    assert (durations.total, durations.largest) == (sum(times), max(times))
+    assert durations.median == pytest.approx(np.median(times), rel=0.01)
+
+
+def test_the_table_of_times_counts_steps_and_not_how_processes_end():
+    times = StageTimes()
+    for number, outcome in enumerate(("done", "failed", "ended")):
+        times.note(Step("worker", 1, 0, number, "on_piece", (), (), 0, 2 * MS, 3 * MS, (number + 1) * MS, outcome))
+    times.note(Step("supervisor", 0, 0, 0, "", (), ("supervisor.restarted#0",), 0, 0, 0, 0))
+    _, row = times.lines()
+    cells = ["1", "2", "1.50 ms", "2.00 ms", "3.00 ms", "3.00 ms", "2.00 ms", "1"]
+    assert row.split("  ")[0] == "worker"
+    assert [cell.strip() for cell in row.split("  ")[1:] if cell.strip()] == cells
+
+
+def test_what_edges_of_policy_latest_left_out():
+    skipped = Skipped(load_graph(Path(__file__).with_name("album.yaml"), ("sink.path=out.txt",)))
+    skipped.note(Step("camera", 0, 0, 0, "source", (), tuple(f"camera.picture#{n}" for n in range(5)), 0, 0, 0, 0))
+    skipped.note(Step("glance", 0, 0, 0, "on_picture", (("picture", "camera.picture#4"),), (), 0, 0, 0, 0))
+    assert list(skipped.lines()) == ["glance.picture: 4 of 5 messages skipped (policy latest)"]
+
+
+def test_memory_does_not_grow_with_the_steps():
+    times, skipped = StageTimes(), Skipped(load_graph(TOYS, ("sink.path=out.txt",)))
+    rng, sizes = random.Random(0), list[int]()
+    for number in range(30_000):
+        consumed, emitted = (("piece", f"splitter.piece#{number}"),), (f"worker.answer#{number}",)
+        spent = [round(rng.lognormvariate(12, 2)) for _ in range(3)]
+        step = Step("worker", number % 2, 0, number // 2, "on_piece", consumed, emitted, 0, *spent)
+        times.note(step)
+        skipped.note(step)
+        if number % 10_000 == 9_999:
+            sizes.append(sum(map(len, times._stages["worker"].computed._like.values())) + len(skipped._consumed))
+    assert sizes[-1] < 1.2 * sizes[0] < 5_000

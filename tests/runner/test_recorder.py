@@ -39,12 +39,13 @@ class Session:
         self.log = folder / "log.txt"
         endpoint = new_endpoint()
         self.bus = Bus("test", endpoint, process=Process("camera", 0), listen=True)
-        self._recorded: list[int] = []
-        self.bus.subscribe("j/camera", self._on_journal)
+        self._recorded: list[tuple[str, str]] = []
+        self.bus.subscribe("j/*", self._on_journal)
         graph = '{"name": "pictures", "seed": 0, "view": null, "stages": {"camera": {"replicas": 1}}}'
         task = Manifest("test", endpoint, str(self.path), graph, (), {"camera/picture": topic(Picture)})
         self.process = spawn("runner.process.recorder", task=msgspec.json.encode(task), log=self.log)
         self._presence = Presence()
+        self._steps = 0
         self.bus.watch(self._presence.update)
 
     def wait(self) -> None:
@@ -56,21 +57,20 @@ class Session:
         self.bus.publish("m/camera/picture", pack(sealed))
         return own
 
-    def journal(self, number: int, *emitted: str) -> None:
-        step = Step("camera", 0, 0, number, "source", (), emitted, number, 0, 0, 0)
-        self.bus.publish("s/camera", pack(step))
+    def journal(self, *emitted: str) -> None:
+        self._tell(Step("camera", 0, 0, self._steps, "source", (), emitted, 0, 0, 0, 0))
+        self._steps += 1
+
+    def _tell(self, step: Step) -> None:
+        self.bus.publish(f"s/{step.stage}", pack(step))
 
     def _on_journal(self, packet: Packet) -> None:
-        self._recorded += [step.number for step in unpack(Journal, packet.payload).steps]
-
-    def flush(self) -> None:
-        """Waits until the recorder has everything that was sent before."""
-        step = Step("camera", 0, 0, 999, "", (), (), 0, 0, 0, 0)
-        self.bus.publish("s/camera", pack(step))
-        wait_until(lambda: 999 in self._recorded)
+        self._recorded += [(step.stage, step.outcome) for step in unpack(Journal, packet.payload).steps]
 
     def stop(self) -> int:
-        self.flush()
+        for stage, steps in (("camera", self._steps), ("supervisor", 0)):
+            self._tell(Step(stage, 0, 0, steps, "", (), (), 0, 0, 0, 0, "ended"))
+        wait_until(lambda: ("supervisor", "ended") in self._recorded)
         self.process.terminate()
         code = self.process.wait(20)
         self.bus.close()
@@ -91,7 +91,7 @@ def test_records_a_30_hz_stream_of_rgbd_without_loss(tmp_path: Path, pictures: l
     session = Session(tmp_path)
     session.wait()
     for number in range(60):
-        session.journal(number, session.send(number, pictures[number % 3]))
+        session.journal(session.send(number, pictures[number % 3]))
         time.sleep(1 / 30)
     assert session.stop() == 0
     recording = Recording(session.path)
@@ -107,7 +107,7 @@ def test_a_recorder_that_stands_still_for_a_moment_loses_nothing(tmp_path: Path,
     os.kill(session.process.pid, signal.SIGSTOP)
     threading.Timer(0.5, os.kill, (session.process.pid, signal.SIGCONT)).start()
     for number in range(30):
-        session.send(number, pictures[number % 3])
+        session.journal(session.send(number, pictures[number % 3]))
     assert session.stop() == 0
     assert len(Recording(session.path).messages) == 30
 
@@ -116,7 +116,7 @@ def test_a_lost_message_is_in_the_verdict_and_the_exit_status(tmp_path: Path, pi
     session = Session(tmp_path)
     session.wait()
     session.send(0, pictures[0])
-    session.journal(0, "camera.picture#0", "camera.picture#1")
+    session.journal("camera.picture#0", "camera.picture#1")
     assert session.stop() == EXIT_INCOMPLETE
     assert "INCOMPLETE: 1 missing: camera.picture#1" in last_lines(session.log, 1)[0]
 
@@ -127,8 +127,8 @@ def test_a_full_disk_stops_nobody_and_what_is_missing_is_named(tmp_path: Path, p
     session.wait()
     resource.prlimit(session.process.pid, resource.RLIMIT_FSIZE, (5_000_000, 5_000_000))
     sent = [session.send(number, pictures[number % 3]) for number in range(12)]
-    for number, id in enumerate(sent):
-        session.journal(number, id)
+    for id in sent:
+        session.journal(id)
     assert session.stop() == EXIT_INCOMPLETE
     said = last_lines(session.log, 1)[0]
     assert "INCOMPLETE: writing failed: File too large" in said
@@ -144,7 +144,7 @@ def test_a_corrupt_message_is_refused_in_one_line_and_the_recorder_lives_on(tmp_
     session.wait()
     session.bus.publish("m/camera/picture", b"\xff\x00 nonsense")
     session.bus.publish("s/camera", b"")
-    session.send(0, pictures[0])
+    session.journal(session.send(0, pictures[0]))
     session.bus.publish("l/camera", pack(LogLine("camera", 0, "info", "done", 0)))
     time.sleep(1)
     assert session.stop() == 0

@@ -1,12 +1,14 @@
 import hashlib
 import io
 import json
+import os
 import shutil
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import jsonschema
 import msgpack
@@ -24,9 +26,9 @@ from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelop
 from runner.recording import writer as writer_module
 from runner.recording.container import Container, Growing, is_being_written
 from runner.recording.provenance import file_hashes
-from runner.recording.recording import Ledger, Recording, Verdict
+from runner.recording.recording import Recording, Verdict
 from runner.recording.writer import RecordingWriter
-from tests.runner.recordings import TOYS, manifest, record_toys
+from tests.runner.recordings import TOYS, ToyRun, manifest, record, record_toys
 from tests.runner.toys import Number, Total
 
 FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -104,7 +106,7 @@ def test_another_reader_validates_every_payload_against_its_schema(toys: Path):
             broken = {**text, "time_ns": "never"}
             assert not jsonschema.Draft202012Validator(described).is_valid(broken)
             validated[schema.name] += 1
-    assert validated == {"Number": 5, "Piece": 20, "Answer": 20, "Total": 5, "Finished": 1, "Step": 40}
+    assert validated == {"Number": 5, "Piece": 20, "Answer": 20, "Total": 5, "Finished": 1, "Step": 48}
 
 
 def test_says_what_ran_where(toys: Path):
@@ -150,21 +152,14 @@ def test_a_lost_message_makes_it_incomplete(tmp_path: Path, lost: str):
     assert f"INCOMPLETE: 1 missing: {lost}" in describe(path)
 
 
-def test_a_gap_shows_without_the_journal():
-    ledger = Ledger(frozenset({"worker"}))
-    for id in ("counter.number#0", "counter.number#3", "worker.answer#5"):
-        ledger.message(id)
-    assert ledger.missing() == ("counter.number#1", "counter.number#2")
-
-
 def test_a_message_that_came_twice_is_counted_once(tmp_path: Path):
     path = tmp_path / "twice.mcap"
-    recorder = writer(path)
-    recorder.put(Envelope, pack(number(0)))
-    recorder.put(Envelope, pack(number(0)))
-    assert recorder.close().complete
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    records = list(ToyRun(graph, tmp_path).records())
+    assert record(graph, path, [records[0], *records])[1].complete
     recording = Recording(path)
-    assert list(recording.messages) == ["counter.number#0"]
+    assert recording.verdict.complete
+    assert len(recording.messages) == 51
     assert recording.repeated["counter.number#0"] == 1
 
 
@@ -172,7 +167,9 @@ def test_a_malformed_payload_is_refused_with_its_reason(tmp_path: Path):
     refused: list[str] = []
     recorder = writer(tmp_path / "malformed.mcap", refused)
     recorder.put(Envelope, b"\xc1 nonsense")
-    recorder.put(Envelope, pack(number(0)))
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    for one in ToyRun(graph, tmp_path).records():
+        recorder.put(type(one), pack(one))
     assert recorder.close().complete
     assert len(refused) == 1
     assert "malformed Envelope" in refused[0]
@@ -229,6 +226,128 @@ class _StalledDisk:
 class _FullDisk:
     def __getattr__(self, name: str):
         raise OSError(28, "No space left on device")
+
+
+# ------------------------------------------------------------------------------------ whatever ends the writer
+
+
+class Failing:
+    """What it stands for, until one of its methods is called for the n-th time."""
+
+    def __init__(self, real: Any, method: str, error: BaseException, at: int = 3) -> None:
+        self._real, self._method, self._error, self._left = real, method, error, at
+
+    def __getattr__(self, name: str) -> Any:
+        return self._call if name == self._method else getattr(self._real, name)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._call(*arguments)
+
+    def _call(self, *arguments: Any) -> Any:
+        self._left -= 1
+        if self._left == 0:
+            raise self._error
+        return (getattr(self._real, self._method) if self._method else self._real)(*arguments)
+
+
+def fail_to_add(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._writer = Failing(recorder._writer, "add_message", error)  # pyright: ignore
+
+
+def fail_to_flush(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._writer = Failing(recorder._writer, "flush", error, at=1)  # pyright: ignore
+
+
+def fail_to_read_back(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._container = Failing(recorder._container, "entries_at", error, at=1)  # pyright: ignore
+
+
+def fail_to_prove(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._proof = Failing(recorder._proof, "enter", error)  # pyright: ignore
+
+
+def fail_to_finish(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._writer = Failing(recorder._writer, "finish", error, at=1)  # pyright: ignore
+
+
+def fail_in_an_action(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder.after_flush(Failing(print, "", error, at=1))
+
+
+def fail_to_refuse(recorder: RecordingWriter, error: BaseException) -> None:
+    recorder._refuse = Failing(recorder._refuse, "", error, at=1)  # pyright: ignore
+    recorder.put(Envelope, b"nonsense")
+
+
+FAILURES = [fail_to_add, fail_to_flush, fail_to_read_back, fail_to_prove, fail_to_finish, fail_in_an_action]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ValueError("odd"), OSError("odd"), SystemExit(1)], ids=repr)
+@pytest.mark.parametrize("fail", [*FAILURES, fail_to_refuse], ids=lambda fail: fail.__name__)
+def test_whatever_ends_the_writer_is_named_and_so_is_all_that_is_not_there(
+    tmp_path: Path, fail: Callable[[RecordingWriter, BaseException], None], error: BaseException
+):
+    path = tmp_path / "ended.mcap"
+    recorder = writer(path)
+    fail(recorder, error)
+    records = [*map(number, range(6)), LogLine("counter", 0, "info", "hello", 0)]
+    for one in records:
+        recorder.put(type(one), pack(one))
+    verdict = recorder.close()
+    recorder.put(Envelope, pack(number(6)))
+    verdicts = (verdict, recorder.close())
+    there = set(Recording(path).messages)
+    for found, sent in zip(verdicts, (6, 7), strict=True):
+        assert not found.complete
+        assert f"writing failed: {type(error).__name__}" in found.reason or f"writing failed: {error}" in found.reason
+        assert set(found.missing) >= {f"counter.number#{sequence}" for sequence in range(sent)} - there
+        assert found.counts == {"counter/number": sent, "log/counter": 1}
+    assert not Recording(path).verdict.complete
+
+
+@pytest.mark.parametrize("where", ["content", "length"])
+def test_what_cannot_be_read_back_as_it_was_written_is_named(tmp_path: Path, where: str):
+    """A file system that forgets, or somebody else who writes to the file."""
+    path = tmp_path / "spoilt.mcap"
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    recorder = RecordingWriter(manifest(graph, path), print)
+    recorder._file = SpoilingFile(recorder._file, path, where)  # pyright: ignore
+    recorder._writer._Writer__stream = recorder._file  # pyright: ignore
+    for one in ToyRun(graph, tmp_path).records():
+        recorder.put(type(one), pack(one))
+    verdict = recorder.close()
+    assert not verdict.complete
+    assert "read back: byte" in verdict.reason
+    assert not Recording(path).verdict.complete
+
+
+class SpoilingFile:
+    """A file of which a part is lost between writing and reading."""
+
+    def __init__(self, file: IO[bytes], path: Path, where: str) -> None:
+        self._file, self._path, self._where = file, path, where
+
+    def write(self, data: bytes) -> int:
+        if self._where == "content" and len(data) > 1000:
+            data = data[:500] + b"spoilt" + data[506:]
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+        if self._where == "length":
+            os.truncate(self._path, self._path.stat().st_size - 1000)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def test_a_recording_that_is_deleted_while_it_is_written_is_not_complete(tmp_path: Path):
+    recorder = writer(tmp_path / "deleted.mcap")
+    (tmp_path / "deleted.mcap").unlink()
+    recorder.put(Envelope, pack(number(0)))
+    verdict = recorder.close()
+    assert "writing failed: No such file or directory" in verdict.reason
+    assert verdict.missing == ("counter.number#0",)
 
 
 # ------------------------------------------------------------------------------------ torn, damaged, foreign

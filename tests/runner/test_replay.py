@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from runner.message.codec import Envelope, Step, decode, envelope, pack, unpack
+from runner.message.codec import Envelope, Lost, Step, decode, envelope, pack, unpack
 from runner.recording.recording import Recording
 from tests.runner.recordings import record_toys, rewrite
 from tests.runner.toys import Answer
@@ -138,7 +138,8 @@ def test_each_incarnation_is_a_fresh_instance_that_goes_on_counting(tmp_path: Pa
             return msgspec.structs.replace(record, incarnation=1, number=record.number - 2)
         return record
 
-    code, said = verify(record_toys(tmp_path, keep=restarted)[0])
+    killed = Lost("gatherer", 0, 0, "killed", 0)
+    code, said = verify(record_toys(tmp_path, keep=restarted, more=[killed])[0])
     assert code == 0, said
     assert "gatherer: 2 steps, 2 messages" in said
     assert "gatherer after restart 1: 3 steps, 3 messages" in said
