@@ -104,22 +104,16 @@ def _python() -> Iterator[Finding]:
 def _packages() -> Iterator[Finding]:
     """What the project needs, by its own metadata; what it was tested with, where the list lies beside it."""
     (project, *_) = importlib.metadata.packages_distributions()["runner"]
-    needed = [
-        re.split(r"[\s;<>=!~\[(]", text)[0]
-        for text in importlib.metadata.requires(project) or ()
-        if "extra ==" not in text
-    ]
+    requirements = importlib.metadata.requires(project) or ()
+    needed = [re.split(r"[\s;<>=!~\[(]", text)[0] for text in requirements if "extra ==" not in text]
     absent = [name for name in needed if _version(name) is None]
     install = f"{sys.executable} -m pip install --constraint constraints.txt --editable ."
     if absent:
         yield Finding("bad", "packages", f"missing: {', '.join(absent)}", install)
         return
     tested = _tested()
-    other = [
-        f"{name} {_version(name)} instead of {tested[key]}"
-        for name in needed
-        if tested.get(key := _key(name)) not in (None, _version(name))
-    ]
+    versions = [(name, _version(name), tested.get(_key(name))) for name in needed]
+    other = [f"{name} {found} instead of {known}" for name, found, known in versions if known not in (None, found)]
     if other:
         yield Finding("note", "packages", f"not the tested versions: {', '.join(other)}", install)
     else:
@@ -234,9 +228,8 @@ def _zenoh() -> Iterator[Finding]:
         client.close()
         server.close()
     except (zenoh.ZError, Refused) as error:
-        yield Finding(
-            "bad", "zenoh", f"{version}: two sessions do not meet: {error}", "see whether a firewall guards loopback"
-        )
+        text = f"{version}: two sessions do not meet: {error}"
+        yield Finding("bad", "zenoh", text, "see whether a firewall guards loopback")
         return
     yield Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet on {endpoint}")
 
@@ -288,11 +281,7 @@ def _limits() -> Iterator[Finding]:
     if files < LEAST_FILES:
         yield Finding("bad", "limits", f"{files} open files, {LEAST_FILES} are needed", f"ulimit -n {LEAST_FILES}")
     elif least is not None and least < LEAST_PROCESSES:
-        yield Finding(
-            "bad",
-            "limits",
-            f"{least} processes and threads, {LEAST_PROCESSES} are needed",
-            f"ulimit -u {LEAST_PROCESSES}",
-        )
+        text = f"{least} processes and threads, {LEAST_PROCESSES} are needed"
+        yield Finding("bad", "limits", text, f"ulimit -u {LEAST_PROCESSES}")
     else:
         yield Finding("good", "limits", f"{files} open files, {least or 'any number of'} processes and threads")
