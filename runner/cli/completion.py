@@ -40,7 +40,7 @@ def completed(action: argparse.Action, complete: Complete) -> None:
 
 
 def run_names(**_: Any) -> list[str]:
-    """The runs that live."""
+    """The runs on this machine."""
     from runner.supervise.registry import runs
 
     return [entry.run for entry in runs()]

@@ -118,11 +118,8 @@ def _python() -> Iterator[Finding]:
 def _packages() -> Iterator[Finding]:
     """What the project needs, by its own metadata; what it was tested with, where the list lies beside it."""
     (project, *_) = importlib.metadata.packages_distributions()["runner"]
-    needed = [
-        re.split(r"[\s;<>=!~\[(]", text)[0]
-        for text in importlib.metadata.requires(project) or ()
-        if "extra ==" not in text
-    ]
+    requirements = importlib.metadata.requires(project) or ()
+    needed = [re.split(r"[\s;<>=!~\[(]", text)[0] for text in requirements if "extra ==" not in text]
     absent = [name for name in needed if _version(name) is None]
     tested = _tested()
     install = f"{sys.executable} -m pip install {'--constraint constraints.txt --editable .' if tested else project}"
@@ -235,11 +232,7 @@ def _limits() -> Iterator[Finding]:
     if files < LEAST_FILES:
         yield Finding("bad", "limits", f"{files} open files, {LEAST_FILES} are needed", f"ulimit -n {LEAST_FILES}")
     elif least is not None and least < LEAST_PROCESSES:
-        yield Finding(
-            "bad",
-            "limits",
-            f"{least} processes and threads, {LEAST_PROCESSES} are needed",
-            f"ulimit -u {LEAST_PROCESSES}",
-        )
+        text = f"{least} processes and threads, {LEAST_PROCESSES} are needed"
+        yield Finding("bad", "limits", text, f"ulimit -u {LEAST_PROCESSES}")
     else:
         yield Finding("good", "limits", f"{files} open files, {least or 'any number of'} processes and threads")

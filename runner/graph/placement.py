@@ -24,7 +24,6 @@ import msgspec
 from runner.contract import Refused
 from runner.graph.document import Document, read_document, suggest
 
-LOOPBACK = "127.0.0.1"
 ROUTER = "router"
 """Common name of a router that is none of the hosts."""
 READER = "reader"

@@ -21,21 +21,6 @@ HOPS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Hop:
-    """One step on a critical path."""
-
-    stage: str
-    travelled_ns: int
-    queued_ns: int
-    computed_ns: int
-
-    @property
-    def total_ns(self) -> int:
-        """From the publication of what was waited for to the end of the step."""
-        return self.travelled_ns + self.queued_ns + self.computed_ns
-
-
-@dataclass(frozen=True, slots=True)
 class CriticalPath:
     """What the last message of a lineage had to wait for, one step after the other."""
 
@@ -43,7 +28,7 @@ class CriticalPath:
     last: str
     elapsed_ns: int
     """From the first message to the last, as the recorder received them."""
-    hops: tuple[Hop, ...]
+    hops: tuple[Step, ...]
 
 
 def latency(path: Path) -> list[str]:
@@ -73,10 +58,8 @@ def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
 def _critical_path(recording: Recording, causes: Causes, lineage: str, ids: Sequence[str]) -> CriticalPath:
     received = {id: recording.messages[id].log_time_ns for id in ids}
     last = max(ids, key=lambda id: received[id])
-    steps = [causes.step_of(id) for id in path_to(recording, causes, last)[1:]]
-    hops = tuple(
-        Hop(step.stage, step.travelled_ns, step.waited_ns, step.computed_ns) for step in steps if step is not None
-    )
+    steps = (causes.step_of(id) for id in path_to(recording, causes, last)[1:])
+    hops = tuple(step for step in steps if step is not None)
     return CriticalPath(lineage, last, received[last] - min(received.values()), hops)
 
 
@@ -115,11 +98,7 @@ def _path_table(paths: Sequence[CriticalPath]) -> list[str]:
 
 
 def _path_row(path: CriticalPath) -> Cells:
-    sums = (
-        sum(hop.travelled_ns for hop in path.hops),
-        sum(hop.queued_ns for hop in path.hops),
-        sum(hop.computed_ns for hop in path.hops),
-    )
+    sums = (sum(getattr(hop, name) for hop in path.hops) for name in ("travelled_ns", "waited_ns", "computed_ns"))
     return path.lineage, str(len(path.hops)), seconds(path.elapsed_ns), *map(seconds, sums), path.last
 
 
@@ -127,7 +106,7 @@ def _path_line(path: CriticalPath) -> str:
     """The costliest hops in the order of the path; further visits of a stage are added to its first."""
     by_stage: dict[str, int] = defaultdict(int)
     for hop in path.hops:
-        by_stage[hop.stage] += hop.total_ns
+        by_stage[hop.stage] += hop.travelled_ns + hop.waited_ns + hop.computed_ns
     costly = set(sorted(by_stage, key=lambda stage: -by_stage[stage])[:HOPS])
     return f"{path.lineage}: " + ", ".join(_named(by_stage, costly))
 

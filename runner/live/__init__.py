@@ -1,1 +1,1 @@
-"""A run that lives, as the command line sees it."""
+"""A graph that runs, as the command line sees it."""

@@ -1,4 +1,4 @@
-"""Reaches a run that lives, and asks its supervisor."""
+"""Reaches a graph that runs, and asks its supervisor."""
 
 from __future__ import annotations
 

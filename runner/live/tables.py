@@ -1,4 +1,4 @@
-"""What the live tools print: tables, rates, log lines and the course of a call."""
+"""What the tools for a running graph print: tables, rates, log lines and the course of a call."""
 
 from __future__ import annotations
 
@@ -116,15 +116,15 @@ def _times(headers: Sequence[Header]) -> list[int]:
 def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> None:
     """Prints log lines as they come, with the time since the start of the run."""
     terminal, began = Terminal(sys.stdout), _began(recording)
-    spoken: set[str] = set()
+    seen: set[str] = set()
     for line in lines:
-        spoken.add(line.stage)
+        seen.add(line.stage)
         if stage in (None, line.stage) and line.level != "debug":
             began = began or line.time_ns
             name = f"{line.stage}.{line.replica}" if line.replica else line.stage
             terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    if stage is not None and stage not in spoken and not _has_output(recording, stage):
-        raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, spoken)}")
+    if stage is not None and stage not in seen and not _has_output(recording, stage):
+        raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
 
 
 def _began(recording: Path) -> int:

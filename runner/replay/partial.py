@@ -8,7 +8,6 @@ stands still before the oldest step that could run is taken instead.
 from __future__ import annotations
 
 import heapq
-import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
@@ -47,7 +46,6 @@ class Answer(msgspec.Struct, frozen=True):
 
     emitted: tuple[Envelope, ...] = ()
     error: str = ""
-    seconds: float = 0.0
 
 
 def serve(node: Node, seed: int, directory: Path, connection: Connection) -> None:
@@ -66,14 +64,14 @@ def serve(node: Node, seed: int, directory: Path, connection: Connection) -> Non
 
 
 def _answer(node: Node, executor: Executor, request: Request) -> Answer:
-    began, emitted, error = time.perf_counter(), list[Envelope](), ""
+    emitted, error = list[Envelope](), ""
     handler = next(handler for handler in node.type.handlers if handler.name == request.handler)
     try:
         arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
         emitted += executor.run(handler, arrivals, request.time_ns)
     except Exception as problem:
         error = f"{type(problem).__name__}: {problem}"
-    return Answer(tuple(emitted), error, time.perf_counter() - began)
+    return Answer(tuple(emitted), error)
 
 
 @dataclass(slots=True)
@@ -120,7 +118,6 @@ class PartialReplay:
         self.emitted: dict[str, Envelope] = {}
         """By id, in the order of emission."""
         self.errors: list[str] = []
-        self.seconds = 0.0
         self._recording = recording
         self._graph = graph
         self._workers = workers
@@ -235,7 +232,6 @@ class PartialReplay:
             raise Refused(f"{_step_name(key)}: {child.end()}") from None
         self._ahead = 0
         stage.idle.append(child)
-        self.seconds += answer.seconds
         if answer.error:
             self.errors.append(f"{_step_name(key)}: {answer.error}")
         for sealed in answer.emitted:

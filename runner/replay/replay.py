@@ -65,8 +65,8 @@ def plan(path: Path, say: Say) -> int:
     rows: list[tuple[str, ...]] = []
     for name, node in change(recording).nodes.items():
         steps = [step for step in recording.steps if step.stage == name]
-        fate = "device: its messages are taken from the recording" if node.type.cls.device else "executed again"
-        rows.append((name, fate, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
+        treatment = "device: its messages are taken from the recording" if node.type.cls.device else "executed again"
+        rows.append((name, treatment, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
     for line in (f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)):
         say(line)
     return 0

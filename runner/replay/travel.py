@@ -166,8 +166,8 @@ class Traveller:
         if process not in self._processes:
             steps = steps_of(self._recording, Task(step.stage, step.incarnation), node)
             if step.stage in replicated(self._recording.graph):
-                mine = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
-                steps = sorted(mine, key=lambda one: one.number)
+                own = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
+                steps = sorted(own, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
             again = Reexecution(
                 self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log

@@ -85,6 +85,7 @@ def test_knows_the_topics_it_needs_and_does_not_hold_before_they_are_there():
         ("counter.number.value >", "is no expression of Python: invalid syntax"),
         ("counter.number.value = 3", "is no expression of Python"),
         ("", "is no expression of Python"),
+        ("counter.number.value" + " + 1" * 90_000, "is no expression of Python"),
     ],
 )
 def test_what_cannot_hold_is_refused_before_anything_runs(text: str, error: str):

@@ -87,7 +87,8 @@ def test_the_critical_path_goes_through_what_came_last(toys: Path):
     assert path == ["counter.number#1", "splitter.piece#7", "worker.answer#7", "gatherer.total#1"]
     (last,) = (found for found in critical_paths(recording, causes) if found.last == "sink.finished#0")
     assert [hop.stage for hop in last.hops] == ["splitter", "worker", "gatherer", "sink"]
-    assert [hop.total_ns for hop in last.hops] == [MS * sum(costs) for costs in COSTS.values()]
+    times = [(hop.travelled_ns, hop.waited_ns, hop.computed_ns) for hop in last.hops]
+    assert times == [tuple(MS * cost for cost in costs) for costs in COSTS.values()]
 
 
 def test_latency_by_edge_stage_and_lineage(toys: Path):

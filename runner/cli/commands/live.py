@@ -35,7 +35,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
-    text = "which run, where several live; the beginning of its name will do"
+    text = "which run, where there are several; the beginning of its name will do"
     completed(parser.add_argument("--run", metavar="NAME", help=text), completion.run_names)
 
 
@@ -73,15 +73,15 @@ def _ps(options: argparse.Namespace) -> int:
     from runner.live.tables import status_text
     from runner.supervise.registry import find_run, runs
 
-    living = [find_run(options.run)] if options.run else runs()
-    for number, entry in enumerate(living):
+    entries = [find_run(options.run)] if options.run else runs()
+    for number, entry in enumerate(entries):
         try:
             with Live(entry) as live:
                 text = status_text(live.status())
         except Refused as refusal:  # it has just ended, or it hangs
             text = str(refusal)
         print("\n" * (number > 0) + text)
-    if not living:
+    if not entries:
         print("no graph is running on this machine")
     return 0
 
