@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from runner.contract import Refused
+from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
@@ -38,6 +39,8 @@ EXIT_INCOMPLETE = 1
 EXIT_REFUSED = 2
 REST_SECONDS = 0.005
 """What may come together before the recorder looks again."""
+UNSEEN_SECONDS = 0.5
+"""How long it may take to see a process that has died at once."""
 SAY_REST_SECONDS = 0.002
 """What may come together before it is said."""
 _Saying = Step | tuple[str, Journal | bytes | memoryview] | None
@@ -64,10 +67,12 @@ class Recorder:
         self._ended = threading.Event()
         self._changing = threading.Lock()
         self._present: set[Process] = set()
-        self._appeared: list[Process] = []
-        """Not yet told what they have to do."""
-        self._lost: dict[Process, bool] = {}
-        """By the supervisor's word; whether all that they have sent is here."""
+        self._lagging: dict[Process, set[tuple[str, int]]] = {}
+        """Successors that have not been told yet what they have to do, and the publishers that know them."""
+        self._gone: set[Process] = set()
+        """Their links have closed: all that they have sent has come."""
+        self._lost: dict[Process, float] = {}
+        """By the supervisor's word: when it is taken that all has come of those that were never seen; 0 once it has."""
         self._heart = Heart(own, self._bus, self._vitals)
 
     def run(self) -> Verdict:
@@ -123,19 +128,42 @@ class Recorder:
     def _look(self) -> None:
         """Takes what is there; what a process has sent that was seen to go is among it."""
         with self._changing:
-            gone = [process for process, here in self._lost.items() if not here and process not in self._present]
-            appeared, self._appeared = self._appeared, []
+            gone = [process for process in self._lost if self._has_all_of(process)]
         for packet in self._heard.take():
             self._take(packet)
-        for process in appeared:
-            self._redelivery.appeared(process)
         for process in gone:
             self._settle(process)
+        with self._changing:
+            ready = [process for process in self._lagging if self._is_known(process)]
+        for process in ready:
+            self._catch_up(process)
         self._redelivery.offer_latest()
+
+    def _has_all_of(self, process: Process) -> bool:
+        """Whether a lost process has just come to where nothing more can come of it."""
+        due = self._lost[process]
+        unseen = process not in self._present and time.monotonic() > due
+        return due > 0 and (process in self._gone or unseen)
+
+    def _is_known(self, process: Process) -> bool:
+        """Whether a process is there and all who publish what it consumes send that to it from now on."""
+        if process not in self._present:
+            return False
+        sources = self._redelivery.sources_of(process.stage)
+        publishers = {(one.stage, one.replica) for one in self._present if one.stage in sources}
+        publishers |= {(SUPERVISOR, 0)} & {(source, 0) for source in sources}
+        return publishers <= self._lagging[process]
+
+    def _catch_up(self, process: Process) -> None:
+        with self._changing:
+            del self._lagging[process]
+        self._redelivery.catch_up(process)
+        self._said.put((f"ready/{process.path}", b""))
 
     def _take(self, packet: Packet) -> None:
         kind, _, rest = packet.key.partition("/")
         take = {"m": self._on_message, "s": self._on_step, "l": self._on_log, "x": self._on_lost}.get(kind)
+        take = self._on_knows if kind == "knows" else take
         if take is not None:
             take(rest, packet)
 
@@ -145,7 +173,7 @@ class Recorder:
             return
         if not self._manifest.steps_only:
             self._writer.put(Envelope, packet.payload)
-        for consumer, port in self._redelivery.note_message(topic, envelope.id, packet.payload):
+        for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
             self._said.put((f"j/{consumer}", Journal(answered=((port, envelope.id),))))
 
     def _on_step(self, stage: str, packet: Packet) -> None:
@@ -156,7 +184,7 @@ class Recorder:
         if step.stage != stage:
             wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
-        elif not self._lost.get(Process(step.stage, step.replica, step.incarnation)):
+        elif self._lost.get(Process(step.stage, step.replica, step.incarnation)) != 0:
             self._writer.put(Step, packet.payload)
             self._redelivery.note_step(step)
             self._said.put(step)
@@ -169,18 +197,34 @@ class Recorder:
         if lost is not None:
             self._writer.put(Lost, packet.payload)
             with self._changing:
-                self._lost.setdefault(Process(lost.stage, lost.replica, lost.incarnation), False)
+                process = Process(lost.stage, lost.replica, lost.incarnation)
+                self._lost.setdefault(process, time.monotonic() + UNSEEN_SECONDS)
+
+    def _on_knows(self, path: str, packet: Packet) -> None:
+        """A publisher sends to a successor from now on; what it has sent before is here."""
+        try:
+            publisher, process = Process.of(packet.payload.decode()), Process.of(path)
+        except (Refused, UnicodeDecodeError) as error:
+            self._refusals.refuse(packet.key, error)
+            return
+        with self._changing:
+            lagging = process in self._lagging
+            self._lagging.setdefault(process, set()).add((publisher.stage, publisher.replica))
+        if not lagging and process in self._present:
+            self._catch_up(process)  # once more, for what this one has sent meanwhile
 
     def _on_presence(self, process: Process, present: bool) -> None:
         with self._changing:
-            if present and process not in self._present:
-                self._appeared.append(process)
+            if present and process.incarnation and process not in self._present:
+                self._lagging.setdefault(process, set())
             (self._present.add if present else self._present.discard)(process)
+            if not present:
+                self._gone.add(process)
 
     def _settle(self, process: Process) -> None:
         """All that a dead process has sent is here: once it is on the disk too, another one may take its place."""
         with self._changing:
-            self._lost[process] = True
+            self._lost[process] = 0
             living = list(self._present)
         self._redelivery.lost(process, living)
         self._writer.after_flush(lambda: self._said.put((f"settled/{process.path}", b"")))

@@ -12,7 +12,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from runner.graph.graph import Destination, Route
-from runner.message.codec import Step, answered
+from runner.message.codec import Envelope, Step, answered
 from runner.message.packet import Process
 
 LATEST_SECONDS = 0.5
@@ -58,16 +58,20 @@ class Redelivery:
         self._send = send
         self._edges = {topic: dict(_edges(destinations)) for topic, destinations in topics.items()}
         self._by_place = {place: waiting for edges in self._edges.values() for place, waiting in edges.items()}
+        self._open: dict[str, dict[str, tuple[str, ...]]] = {}
+        """Causes of the messages, by stage and id, whose step has not come yet."""
         self._recent: OrderedDict[str, None] = OrderedDict()
         """Ids of messages that have come lately."""
         self._early: set[tuple[str, int, str, str]] = set()
         """(stage, taker, port, id) done with before it came: its publisher's link is the slower one."""
 
-    def note_message(self, topic: str, id: str, payload: bytes) -> Iterator[tuple[str, str]]:
+    def note_message(self, topic: str, message: Envelope, payload: bytes) -> Iterator[tuple[str, str]]:
         """Takes a message that has come; yields (stage, port) of consumers that had done with it already.
 
         Its publisher has died meanwhile and its successor, which has sent it once more, does not know that.
         """
+        id = message.id
+        self._open.setdefault(topic.partition("/")[0], {})[id] = message.causes
         known = id in self._recent
         self._recent[id] = None
         if len(self._recent) > REMEMBERED:
@@ -82,17 +86,33 @@ class Redelivery:
 
     def note_step(self, step: Step) -> None:
         """Takes a step."""
+        for id in step.emitted:
+            self._open.get(step.stage, {}).pop(id, None)
         for port, id in answered(step):
             for taker in (step.replica, -1):
                 waiting = self._by_place.get((step.stage, taker, port))
                 if waiting is not None and not waiting.done(id) and id not in self._recent:
                     self._early.add((step.stage, taker, port, id))
 
-    def appeared(self, process: Process) -> None:
-        """Sends a new process all that it has to do, oldest first."""
-        for (stage, taker, _), waiting in self._by_place.items():
-            if stage == process.stage and taker in (process.replica, -1):
-                self._again(process.replica, waiting, (*waiting.kept, *waiting.messages.items()))
+    def sources_of(self, consumer: str) -> set[str]:
+        """The stages that a stage gets messages from."""
+        return {
+            topic.partition("/")[0]
+            for topic, edges in self._edges.items()
+            for stage, _, _ in edges
+            if stage == consumer
+        }
+
+    def catch_up(self, process: Process) -> None:
+        """Sends a new process all that it has to do: first what its predecessor was in the midst of, then the oldest.
+
+        A step that is taken again in the same order emits the same ids.
+        """
+        begun = {id for causes in self._open.get(process.stage, {}).values() for id in causes}
+        for place, waiting in self._by_place.items():
+            if place[0] == process.stage and place[1] in (process.replica, -1):
+                messages = (*waiting.kept, *waiting.messages.items())
+                self._again(process.replica, waiting, sorted(messages, key=lambda message: message[0] not in begun))
 
     def lost(self, process: Process, living: Iterable[Process]) -> None:
         """Sends what a dead process has published, and nobody has done with, to those who may not have got it."""

@@ -39,6 +39,7 @@ SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
 REMEMBERED = 10_000
 """Ids a process remembers to recognise what it is sent twice."""
+CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
 """How long a process that ends waits for the recorder to have its steps."""
 EXIT_FAILED = 1
@@ -111,6 +112,9 @@ class StageProcess:
         """(port, id) of what was refused since the last step."""
         self._refusals = Refusals(lambda text: self._log(text, "error"))
         self._mailbox = Mailbox(self._node)
+        self._catching_up = threading.Lock()
+        self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
+        """What has come before the recorder has sent again what is older; None once it has."""
         self._parts = Parts()
         self._steps = 0
         self._recorded = threading.Condition()
@@ -126,6 +130,8 @@ class StageProcess:
         expected = {*self._task.processes, (RECORDER, 0), (GATEWAY, 0)}
         gc.freeze()  # what set-up has made stays: no collection need look at it again
         if self._presence.wait_for(expected, self._stopping.is_set):
+            while self._early is not None and not self._stopping.is_set():
+                time.sleep(CATCH_UP_SECONDS)
             self._start()
             self._serve()
 
@@ -161,7 +167,8 @@ class StageProcess:
         for port, edge in self._node.inputs.items():
             listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
             listen(f"m/{edge.stage}/{edge.port}", partial(self._on_message, port))
-        self._bus.hand_over(f"again/{own}/*", lambda packet: self._on_message(packet.end, packet))
+        self._bus.hand_over(f"again/{own}/*", lambda packet: self._arrive(packet.end, packet))
+        self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._on_ready())
         self._bus.hand_over(f"d/{own}/*", self._on_deal)
         self._bus.hand_over("e/**", self._on_end)
         self._bus.subscribe("x/*", self._on_lost)
@@ -194,6 +201,8 @@ class StageProcess:
         if present:
             self._peers.appeared(process)
             self._delivery.appeared(process)
+            if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
+                self._bus.publish(f"knows/{process.path}", own.path.encode())
 
     def _on_lost(self, packet: Packet) -> None:
         lost = self._refusals.read(Lost, packet)
@@ -224,6 +233,20 @@ class StageProcess:
                 self._recorded.notify_all()
 
     def _on_message(self, port: str, packet: Packet) -> None:
+        with self._catching_up:
+            if self._early is not None:
+                self._early.append((port, packet))
+                return
+        self._arrive(port, packet)
+
+    def _on_ready(self) -> None:
+        """What is older than all that came directly has been sent again by now."""
+        with self._catching_up:
+            for port, packet in self._early or ():
+                self._arrive(port, packet)
+            self._early = None
+
+    def _arrive(self, port: str, packet: Packet) -> None:
         """Hands what has come to the thread that runs steps; of parts only its own."""
         if port in self._node.inputs and self._node.shares(port):
             try:

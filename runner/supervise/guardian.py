@@ -336,8 +336,7 @@ class Guardian:
     def _start_successor(self, child: Child, reason: str, crashes: int) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
-        waits = child.announced and process not in self._settled
-        if waits and time.monotonic() < child.dies_at + SETTLE_SECONDS:
+        if process not in self._settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
             return
         successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
         successor.restarted_because, successor.crashes = reason, crashes

@@ -185,6 +185,8 @@ class Supervisor:
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
             self._delivery.appeared(process)
+            if process.incarnation:
+                self._bus.publish(f"knows/{process.path}", self._own.path.encode())
         self._guardian.note_presence(process, present)
 
     # ------------------------------------------------------------------------------------------ what is published

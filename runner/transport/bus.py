@@ -10,6 +10,8 @@ Below the name of the run stand the keys, of which a stranger may hear all (docs
 ``j/STAGE``                                 journal: steps that the recorder has; what they consumed is done with
 ``d/STAGE/REPLICA/PORT``                    which of the parts on ``m`` this replica is to work on (Deal)
 ``again/STAGE/REPLICA/PORT``                from the recorder: a message that this process may have missed
+``knows/STAGE/REPLICA/INCARNATION``         from a publisher: it sends to this new process from now on
+``ready/STAGE/REPLICA/INCARNATION``         from the recorder: this new process has been sent again all that is older
 ``e/STAGE/REPLICA/INCARNATION``             this process will publish no messages any more
 ``settled/STAGE/REPLICA/INCARNATION``       the recorder has on the disk all that a dead process has sent
 ``h/STAGE/REPLICA``                         a sign of life twice a second (Pulse)

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from runner.graph.graph import Destination, Route
-from runner.message.codec import Outcome, Step
+from runner.message.codec import Envelope, Outcome, Step
 from runner.message.packet import Process
 from runner.process import redelivery
 from runner.process.redelivery import Redelivery
@@ -25,12 +25,20 @@ class Recorder:
 
     def message(self, number: int) -> tuple[str, list[tuple[str, str]]]:
         id = f"counter.number#{number}"
-        return id, list(self.redelivery.note_message(TOPIC, id, id.encode()))
+        sealed = Envelope(id, id, 0, "Number", 1, (), msgspec.Raw(b""))
+        return id, list(self.redelivery.note_message(TOPIC, sealed, id.encode()))
 
-    def step(self, *consumed: str, replica: int = 0, outcome: Outcome = "done", left: tuple[str, ...] = ()) -> None:
+    def step(
+        self,
+        *consumed: str,
+        replica: int = 0,
+        outcome: Outcome = "done",
+        left: tuple[str, ...] = (),
+        emitted: tuple[str, ...] = (),
+    ) -> None:
         pairs, others = tuple(("input", id) for id in consumed), tuple(("input", id) for id in left)
         self.redelivery.note_step(
-            Step("worker", replica, 0, 0, "on", pairs, (), 0, 0, 0, 0, outcome=outcome, left=others)
+            Step("worker", replica, 0, 0, "on", pairs, emitted, 0, 0, 0, 0, outcome=outcome, left=others)
         )
 
     def take(self) -> list[tuple[str, str]]:
@@ -43,8 +51,21 @@ def test_a_new_process_gets_what_nobody_has_done_with():
     recorder = Recorder()
     first, second, third = (recorder.message(number)[0] for number in range(3))
     recorder.step(second)
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == [("0", first), ("0", third)]
+
+
+def test_what_a_process_was_in_the_midst_of_comes_first():
+    """So that it gives the same ids to the same messages."""
+    recorder = Recorder()
+    first, second = (recorder.message(number)[0] for number in range(2))
+    begun = Envelope("worker.answer#0", second, 0, "Answer", 1, (second,), msgspec.Raw(b""))
+    assert list(recorder.redelivery.note_message("worker/answer", begun, b"")) == []
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
+    assert recorder.take() == [("0", second), ("0", first)]
+    recorder.step(emitted=("worker.answer#0",))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
+    assert recorder.take() == [("0", first), ("0", second)]
 
 
 def test_what_a_dead_publisher_has_sent_is_sent_to_who_may_lack_it():
@@ -59,7 +80,7 @@ def test_parts_are_done_with_by_any_replica():
     recorder = Recorder(replicas=2, shared=True)
     first, second = (recorder.message(number)[0] for number in range(2))
     recorder.step(first, replica=1)
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == [("0", second)]
 
 
@@ -68,7 +89,7 @@ def test_what_joins_keep_is_sent_again_though_it_was_used():
     first, second = (recorder.message(number)[0] for number in range(2))
     recorder.step(first)
     recorder.step(second)
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == [("0", second)]
 
 
@@ -80,7 +101,7 @@ def test_what_was_refused_is_done_with_and_what_a_failed_step_or_an_end_leaves_i
         recorder.step(id, outcome=outcome)
     else:
         recorder.step(outcome=outcome, left=(id,))
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == ([("0", id)] if again else [])
 
 
@@ -89,7 +110,7 @@ def test_a_message_that_was_consumed_before_it_came_is_answered_when_it_comes():
     recorder = Recorder()
     recorder.step("counter.number#0")
     assert recorder.message(0) == ("counter.number#0", [("worker", "input")])
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == []
 
 
@@ -100,7 +121,7 @@ def test_a_message_that_comes_again_after_it_was_consumed_is_answered():
     assert recorder.message(0)[1] == []
     recorder.step(id)
     assert recorder.message(0)[1] == [("worker", "input")]
-    recorder.redelivery.appeared(Process("worker", 0, 1))
+    recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == []
 
 
