@@ -35,7 +35,7 @@ from runner.hosts.head import (
     this_machine,
 )
 from runner.message.packet import Packet, Process
-from runner.process.children import Family, behind, last_lines, signal_group, spawn
+from runner.process.children import Family, Spawned, behind, last_lines, spawn
 from runner.recording.provenance import revision
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
@@ -50,7 +50,7 @@ GONE = 1
 
 @dataclass(slots=True)
 class _Child:
-    handle: subprocess.Popen[bytes]
+    handle: Spawned
     log: Path
 
 
@@ -168,7 +168,7 @@ class Agent:
         if child is None:
             return
         if order.group:
-            signal_group(child.handle, signal.Signals(order.signum))
+            child.handle.signal_group(order.signum)
         else:
             child.handle.send_signal(order.signum)
 
@@ -187,11 +187,11 @@ class Agent:
     def _end_all(self) -> None:
         """Asks what is left to end, then kills it."""
         for child in self._children.values():
-            signal_group(child.handle, signal.SIGTERM)
+            child.handle.signal_group(signal.SIGTERM)
         for child in self._children.values():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.handle.wait(GRACE_SECONDS)
-            signal_group(child.handle, signal.SIGKILL)
+            child.handle.signal_group(signal.SIGKILL)
             child.handle.wait()
         if left := self._family.close():
             self._say(f"the stages {behind(left)}")

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.graph.graph import Limits
-from runner.hosts.head import RemoteChild
 from runner.message.codec import Pulse, Step
 from runner.message.packet import Process
-from runner.process.children import ending, last_lines, signal_group
+from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, gigabytes, oom_kills
 from runner.process.step import sequence_of
 
@@ -22,7 +21,7 @@ class Child:
     """One process of a run, as its supervisor sees it."""
 
     process: Process
-    handle: subprocess.Popen[bytes] | RemoteChild
+    handle: Handle
     log: Path
     started: float = field(default_factory=time.monotonic)
     announced: bool = False
@@ -80,11 +79,11 @@ class Progress:
 def end_all(children: list[Child], grace_seconds: float) -> None:
     """Asks children to end, kills those that do not, and whatever they have left behind."""
     for child in children:
-        signal_group(child.handle, signal.SIGTERM)
+        child.handle.signal_group(signal.SIGTERM)
     deadline = time.monotonic() + grace_seconds
     for child in children:
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.handle.wait(max(0.0, deadline - time.monotonic()))
     for child in children:
-        signal_group(child.handle, signal.SIGKILL)
+        child.handle.signal_group(signal.SIGKILL)
         child.handle.wait()

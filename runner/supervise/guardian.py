@@ -13,6 +13,7 @@ from runner.hosts.head import Hosts
 from runner.message.codec import Pulse, Step
 from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, last_lines
+from runner.process.fork_server import ForkServer
 from runner.process.health import Pulses, Watch
 from runner.process.stage_process import EXIT_REFUSED
 from runner.supervise.child import Child, Progress, end_all
@@ -53,6 +54,7 @@ class Guardian:
         run: Run,
         hosts: Hosts | None,
         terminal: Terminal,
+        forks: ForkServer,
         *,
         say: Callable[[str, Level], None],
         announce: Callable[[Restarted], None],
@@ -64,7 +66,7 @@ class Guardian:
         self._terminal = terminal
         self._say = say
         self._announce = announce
-        self._launch = Launcher(run, hosts)
+        self._launch = Launcher(run, hosts, forks)
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None

@@ -25,24 +25,34 @@ def add_commands(commands: Commands) -> None:
 
 
 def _up(options: argparse.Namespace) -> int:
-    from runner.graph.graph import load_graph
-    from runner.supervise.supervisor import Supervisor
-    from runner.terminal import Terminal
+    from runner.process.forks import become_clean
 
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     settings = (*options.settings, *seed)
     host = None if options.here else _chosen_host(options.graph, settings, options.host)
-    terminal = Terminal()
     if host is not None:
         return _take_part(options, settings, host)
+    become_clean("runner.cli", *options.arguments)
+    return _supervise(options, settings)
+
+
+def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
+    """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
+    from runner.graph.graph import SUPERVISOR, load_graph
+    from runner.process.fork_server import ForkServer
+    from runner.supervise.supervisor import Supervisor
+    from runner.terminal import Terminal
+
+    terminal = Terminal()
     graph = load_graph(options.graph, settings)
-    graph = graph.here() if options.here else graph
+    forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
-        graph,
+        graph.here() if options.here else graph,
         file=options.graph,
         recordings=options.recordings,
         settings=settings,
         terminal=terminal,
+        forks=forks,
         steps_only=options.steps_only,
     )
     end = supervisor.run(view=options.view)
