@@ -122,36 +122,37 @@ def _serve(connection: Connection, other_end: Connection) -> None:
 
 
 def _start(order: _Order, connection: Connection) -> int:
-    """Starts a process that the supervisor adopts; returns its id once that has happened."""
+    """Starts a process that the supervisor adopts; returns its id once that has happened and it is what it will be."""
     importlib.import_module(order.module)
     refuse_threads()
     reading, writing = os.pipe()
     between = os.fork()
     if between == 0:
-        parent, foreign = os.getpid(), (connection.fileno(), reading, writing)
+        parent = os.getpid()
+        os.close(reading)
         with contextlib.suppress(BaseException):
-            pid = fork(lambda: _live(order, parent, foreign), Path(order.log))
-            os.write(writing, pid.to_bytes(8, "little"))
+            fork(lambda: _live(order, parent, connection, writing), Path(order.log))
         os._exit(0)
-    os.waitpid(between, 0)
     os.close(writing)
+    os.waitpid(between, 0)
     with open(reading, "rb") as answer:  # noqa: PTH123 - a descriptor
-        pid = int.from_bytes(answer.read(8), "little")
+        pid = int.from_bytes(answer.read(), "little")
     if not pid:
-        raise OSError(f"{order.module} {order.name}: the system has no room for another process")
+        raise OSError(f"{order.module} {order.name} could not be forked")
     return pid
 
 
-def _live(order: _Order, first_parent: int, foreign: tuple[int, ...]) -> int:
-    """What the new process does; ``foreign`` are descriptors of the fork server."""
-    for descriptor in foreign:
-        os.close(descriptor)
+def _live(order: _Order, parent: int, connection: Connection, writing: int) -> int:
+    """What the new process does, with the fork server's ``connection``, and a pipe to say that it is there."""
+    connection.close()
     _read_from_stdin(order.task)
     os.environ.update(order.environment)
     _show(f"{order.module} {order.name}", order.environment[DESCENT])
     sys.argv = [order.module]
-    while os.getppid() == first_parent:  # until the supervisor has adopted it
+    while os.getppid() == parent:  # until the supervisor has adopted it
         time.sleep(0.0005)
+    os.write(writing, os.getpid().to_bytes(8, "little"))
+    os.close(writing)
     try:
         return importlib.import_module(order.module).main()
     finally:
