@@ -28,7 +28,8 @@ class _Order(msgspec.Struct, frozen=True):
     """A process to start."""
 
     module: str
-    """Its ``main`` takes the task from stdin and returns the exit status."""
+    """Its ``main`` takes the task from stdin and returns the exit status; its ``prepare``, if there is one, is called
+    with the task before the fork."""
     name: str
     """What tells it from others of its module."""
     task: bytes
@@ -123,7 +124,10 @@ def _serve(connection: Connection, other_end: Connection) -> None:
 
 def _start(order: _Order, connection: Connection) -> int:
     """Starts a process that the supervisor adopts; returns its id once that has happened and it is what it will be."""
-    importlib.import_module(order.module)
+    prepare = getattr(importlib.import_module(order.module), "prepare", None)
+    if prepare is not None:
+        with contextlib.suppress(Exception):  # the process itself says what is wrong
+            prepare(order.task)
     refuse_threads()
     reading, writing = os.pipe()
     between = os.fork()

@@ -159,6 +159,7 @@ class Cone:
         node = replace(node, inputs={port: replace(edge, policy="block") for port, edge in node.inputs.items()})
         files = folder / node.name
         files.mkdir()
+        node.prepare()
         idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
         return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
 

@@ -113,6 +113,7 @@ class _Verification:
             node = node_from_entry(stage, self._graph["stages"][stage])
             if not node.type.cls.device:
                 self._executed.append(stage)
+                node.prepare()
                 for task in tasks_of(self._recording, node, workers):
                     yield Job(task, lambda node=node, task=task: self._work(node, task, folder))
 

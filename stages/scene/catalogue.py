@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import fast_simplification
 import numpy as np
@@ -19,6 +20,7 @@ from stages.scene.distinct import distinct_rows
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 GraspKind = Literal["top", "side"]
+T = TypeVar("T")
 
 _AGGRESSIVENESS = (3.0, 5.0, 7.0)
 """Of mesh simplification: how fast its tolerance grows."""
@@ -114,12 +116,16 @@ class CatalogueObject:
 
         Quadric decimation (Garland and Heckbert 1997); each vertex takes the colour of the nearest original one.
         """
-        if triangles not in self._simplified:
-            self._simplified[triangles] = _decimated(self.mesh, triangles)
-        return self._simplified[triangles]
+        return self.once(("simplified", triangles), lambda: _decimated(self.mesh, triangles))
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make`` makes of this object, made once for all that use the object; nobody may change it."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
 
     @cached_property
-    def _simplified(self) -> dict[int, Mesh]:
+    def _made(self) -> dict[Hashable, Any]:
         return {}
 
 
@@ -139,6 +145,12 @@ class Catalogue:
         from stages.scene.loading import read_objects
 
         return Catalogue(read_objects(path))
+
+    @staticmethod
+    @cache
+    def shared(path: Path) -> Catalogue:
+        """As :meth:`load`, but read once for all stages of this process and of those that are forked from it."""
+        return Catalogue.load(path)
 
     def __getitem__(self, label: str) -> CatalogueObject:
         """The object of that name.
