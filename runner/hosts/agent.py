@@ -35,7 +35,8 @@ from runner.hosts.head import (
     this_machine,
 )
 from runner.message.packet import Packet, Process
-from runner.process.children import Family, Spawned, behind, last_lines, spawn
+from runner.process.children import Family, Handle, behind, last_lines
+from runner.process.fork_server import ForkServer
 from runner.recording.provenance import revision
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
@@ -50,14 +51,14 @@ GONE = 1
 
 @dataclass(slots=True)
 class _Child:
-    handle: Spawned
+    handle: Handle
     log: Path
 
 
 class Agent:
     """What ``runner up GRAPH --host NAME`` is on every host but the head."""
 
-    def __init__(self, document: Document, host: str, *, recordings: Path, terminal: Terminal):
+    def __init__(self, document: Document, host: str, *, recordings: Path, terminal: Terminal, forks: ForkServer):
         """Checks the host's credentials; raises Refused where they do not hold."""
         self._document = document
         self._layout = read_layout(document)
@@ -65,6 +66,7 @@ class Agent:
         self._host = host
         self._recordings = recordings
         self._terminal = terminal
+        self._forks = forks
         self._session = secrets.randbits(24)
         self._events: queue.SimpleQueue[Order] = queue.SimpleQueue()
         self._head_is_there = False
@@ -157,11 +159,12 @@ class Agent:
         process = order.process
         task = msgspec.structs.replace(order.task, directory=str(folder.absolute()), network=self._network)
         log = folder / "log" / f"{process.stage}-{process.replica}.txt"
-        mark = self._family.mark(process.path)
-        child = _Child(spawn("runner.process.stage_process", task=msgspec.json.encode(task), log=log, mark=mark), log)
-        self._children[process] = child
-        self._say(f"starts {process.stage}.{process.replica}")
-        return Started(process, child.handle.pid)
+        name, mark = f"{process.stage}.{process.replica}", self._family.mark(process.path)
+        module, data = "runner.process.stage_process", msgspec.json.encode(task)
+        handle = self._forks.start(module, name, task=data, log=log, mark=mark)
+        self._children[process] = _Child(handle, log)
+        self._say(f"starts {name}")
+        return Started(process, handle.pid)
 
     def _signal(self, order: Signal) -> None:
         child = self._children.get(order.process)
@@ -180,7 +183,7 @@ class Agent:
             if left := self._family.end(process.path):
                 self._say(f"{process.stage}.{process.replica} {behind(left)}")
         return [
-            Ended(process, child.handle.returncode, "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
+            Ended(process, child.handle.wait(), "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
             for process, child in ended
         ]
 
@@ -193,6 +196,7 @@ class Agent:
                 child.handle.wait(GRACE_SECONDS)
             child.handle.signal_group(signal.SIGKILL)
             child.handle.wait()
+        self._forks.close()
         if left := self._family.close():
             self._say(f"the stages {behind(left)}")
 

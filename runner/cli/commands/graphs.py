@@ -76,14 +76,18 @@ def _chosen_host(file: Path, settings: tuple[str, ...], name: str | None) -> str
 def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str) -> int:
     from runner.graph.document import read_document
     from runner.hosts.agent import Agent, refuse_settings
+    from runner.process.fork_server import ForkServer
+    from runner.process.forks import become_clean
     from runner.terminal import Terminal
 
     document = read_document(options.graph)
     refuse_settings(settings, host)
     for setting in settings:
         document.set(setting)
+    become_clean("runner.cli", *options.arguments)
     terminal = Terminal()
-    end = Agent(document, host, recordings=options.recordings, terminal=terminal).run()
+    forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
+    end = Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
     terminal.plain(end.reason)
     return end.code
 
