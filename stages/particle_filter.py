@@ -61,7 +61,7 @@ class ParticleFilter(Stage):
 
     @classmethod
     def prepare(cls, config: Config) -> None:
-        """Lays out the objects and loads the kernels: what is not forked from here compiles no other ones."""
+        """Lays out the objects and loads the kernels; a GPU belongs to the process that opens it."""
         if config.device == "cpu":
             cls(config)
 

@@ -55,6 +55,7 @@ class ForkServer:
         self._asking = threading.Lock()
         self._connection, theirs = Pipe()
         gc.freeze()  # a collection would write to every page, and whoever writes to a page has a copy of it
+        gc.enable()
         try:
             self._server = Forked(fork(lambda: _serve(theirs, self._connection)))
         except Threads as reason:

@@ -103,6 +103,15 @@ with tempfile.TemporaryDirectory() as own:
     assert sorted((tmp_path / "one.txt").read_text().splitlines()[1:]) == ["a thread", "at the end"]
 
 
+def test_what_is_prepared_in_the_fork_server_is_there_in_what_it_forks(tmp_path: Path):
+    script = """
+said = [start("print(*PREPARED)", str(number)).wait() for number in range(3)]
+show(*said, server(), [(folder / f"{number}.txt").read_text() for number in range(3)])
+"""
+    ((*codes, server, printed),) = shown(tmp_path, script)
+    assert (codes, printed) == ([0, 0, 0], [f"{server}\n", f"{server} {server}\n", f"{server} {server} {server}\n"])
+
+
 def test_fifty_processes_start_at_once(tmp_path: Path):
     script = """
 fifty = [start(f"import time; time.sleep(0.2); code = {number}", str(number)) for number in range(50)]

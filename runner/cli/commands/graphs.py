@@ -1,6 +1,7 @@
 """Commands on graph files: ``up``, ``check``, ``graph``, ``schema``."""
 
 import argparse
+import gc
 import json
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
     from runner.terminal import Terminal
 
     terminal = Terminal()
+    gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, settings)
     forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
