@@ -1,8 +1,8 @@
 """From `runner up` to ready, and whether a cold start loses anything: `python -m benchmarks.starts [--times 200]`.
 
-First the default graph: how long after its start every process is ready, and how much of that the imports and set-up of
-its stages take without a runner. Then, again and again, a small graph whose source speaks the moment it may: each
-recording must be COMPLETE and hold every message.
+First the default graph: how long after its start every process is ready, how much processor time that takes and how
+much memory all processes hold then, where each is a new interpreter and where each is forked. Then, again and again, a
+small graph whose source speaks the moment it may: each recording must be COMPLETE and hold every message.
 """
 
 from __future__ import annotations
@@ -10,50 +10,75 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from runner.graph.graph import Graph, load_graph, node_entry
-from runner.process.children import ENVIRONMENT
+from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
 
 _GRAPH = Path(__file__).parents[1] / "graph.yaml"
 _MESSAGES = 100
+_TICKS = os.sysconf("SC_CLK_TCK")
+FORKED = ("-m", "runner.cli")
+SPAWNED = (
+    "-c",
+    "import sys, threading; threading.Thread(target=threading.Event().wait, daemon=True).start();"
+    "from runner.cli.main import main; sys.exit(main())",
+)
+"""A process with a second thread is not forked."""
 
 
-def seconds_to_ready(graph: Path, folder: Path) -> float:
-    """Wall time from the command to the line that says that all processes are ready; the graph is ended then."""
-    command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder)]
+@dataclass(frozen=True)
+class Start:
+    """What it took until a graph was ready."""
+
+    seconds: float
+    """From the command to the line that says so."""
+    processor: float
+    """Seconds of all its processes."""
+    memory: float
+    """Bytes that they hold, what is shared divided among those that share it (proportional set size)."""
+
+
+def start(graph: Path, folder: Path, program: tuple[str, ...]) -> Start:
+    """Starts a graph, and ends it once it is ready."""
+    environment = clean_environment() if program == SPAWNED else None  # or it would start again, without the thread
+    command = [sys.executable, *program, "up", str(graph), "--recordings", str(folder)]
     began = time.monotonic()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as run:
         assert run.stdout is not None
         for line in run.stdout:
-            if re.search(r"processes are ready", line):
-                taken = time.monotonic() - began
+            if "processes are ready" in line:
+                seconds = time.monotonic() - began
+                processes = [run.pid, *_descendants(run.pid)]
+                found = Start(seconds, sum(map(_processor, processes)), sum(map(_memory, processes)))
                 run.terminate()
                 run.stdout.read()
-                return taken
+                return found
     raise SystemExit(f"{graph} never became ready")
 
 
-def seconds_to_construct(graph: Graph) -> float:
-    """Wall time to import and set up every stage of a graph, each in a process, all at once and without a runner."""
-    code = (
-        "import json, sys; from runner.graph.graph import node_from_entry;"
-        "node_from_entry(sys.argv[1], json.loads(sys.argv[2])).construct()"
-    )
-    began = time.monotonic()
-    tasks = [(node.name, json.dumps(node_entry(node))) for node in graph.nodes.values() for _ in range(node.replicas)]
-    environment = {**os.environ, **ENVIRONMENT}
-    children = [subprocess.Popen([sys.executable, "-c", code, *task], env=environment) for task in tasks]
-    for child in children:
-        child.wait()
-    return time.monotonic() - began
+def _descendants(pid: int) -> Iterator[int]:
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in map(int, (task / "children").read_text().split()):
+            yield child
+            yield from _descendants(child)
+
+
+def _processor(pid: int) -> float:
+    """User and system time of a process and of its children that have ended."""
+    return sum(map(int, Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15])) / _TICKS
+
+
+def _memory(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
 
 
 def cold_start(folder: Path) -> bool:
@@ -78,14 +103,17 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=3, help="of the default graph")
     options = parser.parse_args()
-    ready: list[float] = []
-    bare: list[float] = []
-    for _ in range(options.rounds):
-        with tempfile.TemporaryDirectory() as folder:
-            bare.append(seconds_to_construct(load_graph(_GRAPH)))
-            ready.append(seconds_to_ready(_GRAPH, Path(folder)))
-    print(f"default graph: ready after {median(ready):.1f} s, imports and set-up alone {median(bare):.1f} s")
-    print(f"the runner adds {median(ready) - median(bare):.1f} s")
+    for name, program in (("a new interpreter", SPAWNED), ("forked", FORKED)):
+        starts: list[Start] = []
+        for _ in range(options.rounds):
+            with tempfile.TemporaryDirectory() as folder:
+                starts.append(start(_GRAPH, Path(folder), program))
+        seconds = sorted(one.seconds for one in starts)
+        print(
+            f"default graph, every process {name}: ready after {median(seconds):.1f} s ({seconds[0]:.1f} to "
+            f"{seconds[-1]:.1f}), {median(one.processor for one in starts):.1f} s of processor time, "
+            f"{median(one.memory for one in starts) / 1e9:.2f} GB"
+        )
     whole = 0
     for _ in range(options.times):
         with tempfile.TemporaryDirectory() as folder:

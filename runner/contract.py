@@ -26,10 +26,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import msgspec
-import numpy as np
+
+if TYPE_CHECKING:  # whoever runs a command waits for what it imports
+    import numpy as np
 
 Level = Literal["debug", "info", "warning", "error"]
 
@@ -196,6 +198,15 @@ class Stage:
     stateful: ClassVar[bool] = False
     """True where what a handler does depends on earlier steps. A restarted process then executes again, silently,
     what its predecessors did, and a replay does the same. Devices cannot: their past lies outside."""
+
+    @classmethod
+    def prepare(cls, config: Any) -> None:
+        """Reads and computes beforehand what every process of this stage would by itself, and keeps it in caches.
+
+        Processes are forked from one that has called this for some stages, and share the memory; it is called once or
+        again, or never. It only fills caches: no threads, no contexts, no files or devices that stay open. What it
+        raises, ``__init__`` must raise too, for here nobody listens.
+        """
 
     @classmethod
     def examine(cls) -> str:

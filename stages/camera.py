@@ -34,7 +34,7 @@ class SimulatedCamera(Stage):
 
         self._noise = config.noise
         self._fetch, self._K = fetch, simulated_camera.K
-        self._camera = simulated_camera.SimulatedCamera(Catalogue.load(config.catalogue))
+        self._camera = simulated_camera.SimulatedCamera(Catalogue.shared(config.catalogue))
         self._looks = 0
 
     @classmethod

@@ -115,7 +115,7 @@ class Demonstrator(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._state = State(goal_name=config.goal_name) if config.scripted else State(phase=Phase.IDLE)
 
     def on_start(self, ctx: Context) -> Arrangement:

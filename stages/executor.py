@@ -32,7 +32,7 @@ class Executor(Stage):
         from stages.planning.transfer import Routine, TransferRoutine
 
         self._config = config
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._robot = fetch.robot_model()
         self._transfers = TransferRoutine
         self._routine: Routine | None = None

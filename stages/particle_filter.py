@@ -59,6 +59,12 @@ class ParticleFilter(Stage):
             if self.lambda_r <= 0:
                 raise Refused(f"particle_filter.lambda_r is {self.lambda_r}; it must be above 0")
 
+    @classmethod
+    def prepare(cls, config: Config) -> None:
+        """Lays out the objects and loads the kernels; a GPU belongs to the process that opens it."""
+        if config.device == "cpu":
+            cls(config)
+
     def __init__(self, config: Config) -> None:
         self.config = config
         make = FilterSettings.paper if config.form == "paper" else FilterSettings
@@ -66,7 +72,7 @@ class ParticleFilter(Stage):
             *config.without
         )
         settings = replace(settings, device=chosen_device(config.device, place="particle_filter.device"))
-        self._filter = SceneFilter(Catalogue.load(config.catalogue), settings, seed=config.seed)
+        self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, seed=config.seed)
         self._filter.warm_up()
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:

@@ -76,7 +76,7 @@ class Planner(Stage):
     def __init__(self, config: Config) -> None:
         search.check_engine(config.engine)
         self._config = config
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
     def on_task(self, task: Task) -> Plan:

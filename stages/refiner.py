@@ -44,7 +44,7 @@ class Refiner(Stage):
         self._refiner: SceneRefiner | None = None
         if config.form == "default":
             settings = RefinementSettings.of(FilterSettings(dof=config.dof).without(*config.without))
-            catalogue = Catalogue.load(config.catalogue)
+            catalogue = Catalogue.shared(config.catalogue)
             self._refiner = SceneRefiner(catalogue, settings)
             self._refiner.warm_up()
             self._judge = Judge(catalogue, dof=config.dof)

@@ -38,7 +38,7 @@ class Report(Stage):
         catalogue: Path
 
     def __init__(self, config: Config) -> None:
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._looks: list[tuple[int, Look]] = []
         self._plans: list[Plan] = []
         self._outcomes: dict[int, Outcome] = {}

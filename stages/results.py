@@ -32,7 +32,7 @@ class BopResults(Stage):
                 raise Refused(f"results.path is '{self.path}'; it must end in .csv")
 
     def __init__(self, config: Config) -> None:
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._path = Path(config.path)
         self._graphs = self._path.with_suffix("")
         try:

@@ -37,7 +37,7 @@ class SceneGraphBuilder(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        catalogue = Catalogue.load(config.catalogue)
+        catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def on_scene_estimate(self, scene_estimate: SceneEstimate) -> SceneGraph:

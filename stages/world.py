@@ -41,7 +41,7 @@ class World(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._catalogue = Catalogue.load(config.catalogue)
+        self._catalogue = Catalogue.shared(config.catalogue)
         self._goal = tabletop.goal_name(config.goal, config.seed)
         self._simulation = Simulation(self._catalogue, tabletop.object_names(self._goal))
 

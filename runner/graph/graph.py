@@ -1,5 +1,6 @@
 """A graph of stages, checked: every key, setting, class and edge, before anything starts."""
 
+import contextlib
 import json
 import math
 import os
@@ -172,6 +173,12 @@ class Node:
     def kept(self, port: str) -> int:
         """How many messages of a port parts that are under way may still need."""
         return max(edge.queue for edge in self.inputs.values()) if self.keeps(port) else 0
+
+    def prepare(self) -> None:
+        """Has the stage fill caches that processes share which are forked from this one; says nothing of failures:
+        they are those of :meth:`construct`."""
+        with contextlib.suppress(Exception):
+            self.type.cls.prepare(self.config)
 
     def construct(self) -> Stage:
         """A new instance with the node's settings."""

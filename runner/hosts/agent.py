@@ -36,7 +36,8 @@ from runner.hosts.head import (
     this_machine,
 )
 from runner.message.packet import Packet, Process
-from runner.process.children import Family, behind, last_lines, signal_group, spawn
+from runner.process.children import Family, Handle, behind, last_lines
+from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import private
@@ -51,14 +52,14 @@ GONE = 1
 
 @dataclass(slots=True)
 class _Child:
-    handle: subprocess.Popen[bytes]
+    handle: Handle
     log: Path
 
 
 class Agent:
     """What ``runner up GRAPH --host NAME`` is on every host but the head."""
 
-    def __init__(self, document: Document, host: str, *, recordings: Path, terminal: Terminal):
+    def __init__(self, document: Document, host: str, *, recordings: Path, terminal: Terminal, forks: ForkServer):
         """Checks the host's credentials; raises Refused where they do not hold."""
         self._document = document
         self._layout = read_layout(document)
@@ -66,6 +67,7 @@ class Agent:
         self._host = host
         self._recordings = recordings
         self._terminal = terminal
+        self._forks = forks
         self._session = secrets.randbits(24)
         self._events: queue.SimpleQueue[Order] = queue.SimpleQueue()
         self._head_is_there = False
@@ -159,18 +161,19 @@ class Agent:
         own = {"directory": str(folder.absolute()), "network": self._network, "gateway": ""}
         task = msgspec.structs.replace(order.task, **own)
         log = folder / "log" / f"{process.stage}-{process.replica}.txt"
-        mark = self._family.mark(process.path)
-        child = _Child(spawn("runner.process.stage_process", task=msgspec.json.encode(task), log=log, mark=mark), log)
-        self._children[process] = child
-        self._say(f"starts {process.stage}.{process.replica}")
-        return Started(process, child.handle.pid)
+        name, mark = f"{process.stage}.{process.replica}", self._family.mark(process.path)
+        module, data = "runner.process.stage_process", msgspec.json.encode(task)
+        handle = self._forks.start(module, name, task=data, log=log, mark=mark)
+        self._children[process] = _Child(handle, log)
+        self._say(f"starts {name}")
+        return Started(process, handle.pid)
 
     def _signal(self, order: Signal) -> None:
         child = self._children.get(order.process)
         if child is None:
             return
         if order.group:
-            signal_group(child.handle, signal.Signals(order.signum))
+            child.handle.signal_group(order.signum)
         else:
             child.handle.send_signal(order.signum)
 
@@ -182,19 +185,20 @@ class Agent:
             if left := self._family.end(process.path):
                 self._say(f"{process.stage}.{process.replica} {behind(left)}")
         return [
-            Ended(process, child.handle.returncode, "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
+            Ended(process, child.handle.wait(), "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
             for process, child in ended
         ]
 
     def _end_all(self) -> None:
         """Asks what is left to end, then kills it."""
         for child in self._children.values():
-            signal_group(child.handle, signal.SIGTERM)
+            child.handle.signal_group(signal.SIGTERM)
         for child in self._children.values():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.handle.wait(GRACE_SECONDS)
-            signal_group(child.handle, signal.SIGKILL)
+            child.handle.signal_group(signal.SIGKILL)
             child.handle.wait()
+        self._forks.close()
         if left := self._family.close():
             self._say(f"the stages {behind(left)}")
 

@@ -29,7 +29,6 @@ from runner.graph.document import Document, read_document, suggest
 from runner.graph.graph import NUMERICAL
 from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
-from runner.hosts.keys import credentials
 from runner.message.packet import Packet, Process
 from runner.process.stage_process import Assignment
 from runner.recording.provenance import (
@@ -417,4 +416,8 @@ def _short(value: Any) -> str:
 
 def network_of(layout: Layout, host: str) -> Network:
     """What the sessions of one host are told; raises Refused where its credentials do not hold."""
-    return layout.network(host, None if layout.keys is None else credentials(layout.keys, host))
+    if layout.keys is None:
+        return layout.network(host, None)
+    from runner.hosts.keys import credentials  # cryptography takes longer to load than the rest of this package
+
+    return layout.network(host, credentials(layout.keys, host))

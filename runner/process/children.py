@@ -15,10 +15,11 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-TAIL_BYTES = 4096
+TAIL_BYTES = 2**15
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
     "MALLOC_MMAP_THRESHOLD_": str(32 * 2**20),
@@ -46,18 +47,50 @@ OOM_SCORE = 500
 _PR_SET_PDEATHSIG = 1
 
 
-def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") -> subprocess.Popen[bytes]:
+class Handle(Protocol):
+    """A process that was started, here or on another host."""
+
+    pid: int
+    returncode: int | None
+    """Once :meth:`poll` or :meth:`wait` has seen its end; negative where a signal killed it."""
+
+    def poll(self) -> int | None:
+        """Its exit code, None while it lives."""
+        ...
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Waits for its end; raises subprocess.TimeoutExpired."""
+        ...
+
+    def send_signal(self, signum: int, /) -> None:
+        """Signals this process alone; one that has gone is no error."""
+        ...
+
+    def signal_group(self, signum: int) -> None:
+        """Signals it and everything it has started, also once it has gone."""
+        ...
+
+
+class Spawned(subprocess.Popen[bytes]):
+    """A process in a group of its own."""
+
+    def signal_group(self, signum: int) -> None:
+        """Signals it and everything it has started, also once it has gone."""
+        signal_group(self.pid, signum)
+
+
+def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") -> Spawned:
     """Starts ``python -m module`` in a process group of its own, with its task on stdin and its output in a file.
 
     What it starts in turn carries its ``mark``, see :class:`Family`.
     """
     with log.open("ab") as output:
-        child = subprocess.Popen(
+        child = Spawned(
             [sys.executable, "-m", module, *arguments],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
-            env={**os.environ, **ENVIRONMENT, **_origin(mark), "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, **ENVIRONMENT, **origin(mark), "PYTHONUNBUFFERED": "1"},
             process_group=0,
         )
     assert child.stdin is not None
@@ -66,8 +99,9 @@ def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") 
     return child
 
 
-def _origin(mark: str) -> dict[str, str]:
-    descent = " ".join(filter(None, [os.environ.get(DESCENT), mark]))
+def origin(mark: str) -> dict[str, str]:
+    """Variables that tell a child of this process whence it comes."""
+    descent = " ".join([*os.environ.get(DESCENT, "").split(), mark])
     return {PARENT: str(os.getpid()), DESCENT: descent, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
@@ -175,31 +209,27 @@ def bound(command: list[str]) -> list[str]:
     return [sys.executable, __file__, str(os.getpid()), *command]
 
 
-class Elsewhere(Protocol):
-    """A process on another host."""
-
-    def signal_group(self, signum: int) -> None:
-        """Has it signalled with everything it started."""
-        ...
-
-
-def signal_group(child: subprocess.Popen[bytes] | Elsewhere, signum: signal.Signals) -> None:
-    """Signals a child and everything it started; one that has gone is no error."""
-    if not isinstance(child, subprocess.Popen):
-        child.signal_group(signum)
-        return
-    try:
-        os.killpg(child.pid, signum)
-    except ProcessLookupError:
-        return
+def signal_group(group: int, signum: int) -> None:
+    """Signals all processes of a group; one that has gone is no error."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(group, signum)
 
 
 def last_lines(log: Path, count: int, start: int = 0) -> list[str]:
-    """The last non-empty lines of what a child printed; ``start`` is where its part of the file begins."""
+    """The last lines of what a child printed that say something; ``start`` is where its part of the file begins."""
     with log.open("rb") as file:
         file.seek(max(start, log.stat().st_size - TAIL_BYTES))
         lines = file.read().decode(errors="replace").splitlines()
-    return [line for line in lines if line.strip()][-count:]
+    return list(_telling(lines))[-count:]
+
+
+def _telling(lines: list[str]) -> Iterator[str]:
+    """Leaves out of a crash's dump what a forked process has from those that it was forked from."""
+    inherited = False
+    for line in lines:
+        inherited = line.startswith('  File "') and (inherited or "runner/process/fork" in line)
+        if line.strip() and not inherited and not line.startswith("Extension modules:"):
+            yield line
 
 
 def ending(code: int) -> str:

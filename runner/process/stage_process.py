@@ -503,6 +503,12 @@ def _summary(error: BaseException) -> str:
     return f"{type(error).__name__}: {error} ({place}:{frame.lineno} in {frame.name})"
 
 
+def prepare(task: bytes) -> None:
+    """Imports and computes what the process that this is assigned to shares with others, before it is forked."""
+    assignment = msgspec.json.decode(task, type=Assignment)
+    node_from_entry(assignment.stage, assignment.entry).prepare()
+
+
 def main() -> int:
     """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
     explain_death()

@@ -24,7 +24,7 @@ from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording, replicated
-from runner.replay.forks import Forked
+from runner.replay.workers import Worker
 
 AHEAD = 16
 """Recorded messages that are delivered while steps run; more would only wait in memory."""
@@ -80,7 +80,7 @@ class _Stage:
 
     node: Node
     inbox: Inbox
-    idle: list[Forked]
+    idle: list[Worker]
     expected: deque[Key]
     """The recorded steps that are still to come, in order."""
     ready: dict[Key, Ready] = field(default_factory=dict[Key, Ready])
@@ -102,7 +102,7 @@ class _Stage:
             return next(iter(self.ready))
         return self.expected[0] if self.expected and self.expected[0] in self.ready else None
 
-    def take(self, key: Key) -> tuple[Ready, Forked]:
+    def take(self, key: Key) -> tuple[Ready, Worker]:
         """Hands a step to a process; recorded ones before it will not be waited for any more."""
         if not self.node.replicated and key in self.expected:
             while self.expected.popleft() != key:
@@ -125,20 +125,20 @@ class PartialReplay:
         self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
         self._frozen = _Frozen(recording, names)
         self._ahead = 0
-        self._running: dict[Connection, tuple[_Stage, Key, Forked]] = {}
-        self._forked: list[Forked] = []
+        self._running: dict[Connection, tuple[_Stage, Key, Worker]] = {}
+        self._processes: list[Worker] = []
         self._stages = {name: self._start(graph.nodes[name], folder) for name in graph.nodes if name in names}
 
     def run(self) -> None:
         """Executes until nothing is left to do, and leaves no process behind."""
         try:
-            for child in self._forked:
+            for child in self._processes:
                 self._await_construction(child)
             self._start_handlers()
             while self._advance():
                 pass
         finally:
-            for child in self._forked:
+            for child in self._processes:
                 child.kill()
 
     @property
@@ -156,6 +156,7 @@ class PartialReplay:
         node = replace(node, inputs={port: replace(edge, policy="block") for port, edge in node.inputs.items()})
         files = folder / node.name
         files.mkdir()
+        node.prepare()
         idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
         return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
 
@@ -167,13 +168,13 @@ class PartialReplay:
         place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
         return sorted(keys, key=lambda key: (MessageId.of(key[2]), place.get(key[1], len(place)), key[3]))
 
-    def _fork(self, node: Node, files: Path, folder: Path) -> Forked:
-        log = folder / f"{node.name}-{len(self._forked)}.txt"
-        child = Forked(lambda connection: serve(node, self._graph.seed, files, connection), log)
-        self._forked.append(child)
+    def _fork(self, node: Node, files: Path, folder: Path) -> Worker:
+        log = folder / f"{node.name}-{len(self._processes)}.txt"
+        child = Worker(lambda connection: serve(node, self._graph.seed, files, connection), log)
+        self._processes.append(child)
         return child
 
-    def _await_construction(self, child: Forked) -> None:
+    def _await_construction(self, child: Worker) -> None:
         try:
             error = msgspec.msgpack.decode(child.receive(), type=Answer).error
         except EOFError:

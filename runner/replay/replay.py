@@ -27,9 +27,9 @@ from runner.inspect.info import seconds, table
 from runner.inspect.summary import Summary
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording, replicated
-from runner.replay.forks import Job, run_each
 from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
 from runner.replay.tolerances import Origin
+from runner.replay.workers import Job, run_each
 
 Say = Callable[[str], None]
 
@@ -125,6 +125,7 @@ class _Verification:
             node = node_from_entry(stage, self._graph["stages"][stage])
             if not node.type.cls.device:
                 self._executed.append(stage)
+                node.prepare()
                 for task in tasks_of(self._recording, node, workers):
                     yield Job(task, lambda node=node, task=task: self._work(node, task, folder))
 

@@ -1,7 +1,6 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
 import signal
-import subprocess
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.graph.graph import Limits
-from runner.hosts.head import RemoteChild
 from runner.message.codec import Pulse, Step, answered
 from runner.message.ids import MessageId
 from runner.message.packet import Process
-from runner.process.children import ending, last_lines, signal_group
+from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, gigabytes, oom_kills
 
 LOOK_SECONDS = 0.01
@@ -28,7 +26,7 @@ class Child:
     """One process of a run, as its supervisor sees it."""
 
     process: Process
-    handle: subprocess.Popen[bytes] | RemoteChild
+    handle: Handle
     log: Path
     started: float = field(default_factory=time.monotonic)
     announced: bool = False
@@ -110,7 +108,7 @@ class Progress:
 def signal_all(children: Iterable[Child], signum: signal.Signals) -> None:
     """Signals processes with all that they have started."""
     for child in children:
-        signal_group(child.handle, signum)
+        child.handle.signal_group(signum)
 
 
 def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child], bool] = lambda _: False) -> None:

@@ -11,7 +11,8 @@ from runner.graph.graph import SUPERVISOR, Graph
 from runner.hosts.head import Hosts
 from runner.message.codec import Pulse, Step, answered
 from runner.message.packet import RECORDER, Process
-from runner.process.children import DUMP, behind, last_lines, signal_group
+from runner.process.children import DUMP, behind, last_lines
+from runner.process.fork_server import ForkServer
 from runner.process.health import Pulses, Watch
 from runner.process.stage_process import EXIT_REFUSED
 from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
@@ -58,6 +59,7 @@ class Guardian:
         run: Run,
         hosts: Hosts | None,
         terminal: Terminal,
+        forks: ForkServer,
         *,
         say: Callable[[str, Level], None],
         announce: Callable[[Restarted], None],
@@ -72,7 +74,7 @@ class Guardian:
         self._say = say
         self._announce = announce
         self._declare_lost = declare_lost
-        self._launch = Launcher(run, hosts)
+        self._launch = Launcher(run, hosts, forks)
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
@@ -134,7 +136,7 @@ class Guardian:
         for child in children:
             if child.handle.poll() is None and child.process not in self._quiet:
                 child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
-                signal_group(child.handle, signal.SIGKILL)
+                child.handle.signal_group(signal.SIGKILL)
                 child.handle.wait()
             self._report_lost(child)
         wait_for(children, END_GRACE_SECONDS)

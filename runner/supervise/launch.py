@@ -10,6 +10,7 @@ from runner.graph.placement import Network
 from runner.hosts.head import Hosts
 from runner.message.packet import RECORDER, Process
 from runner.process.children import Family, spawn
+from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.process.stage_process import Assignment
 from runner.recording.writer import Manifest, topic
@@ -58,10 +59,11 @@ class Run:
 class Launcher:
     """Starts single processes of one run, here or on the host that the graph names."""
 
-    def __init__(self, run: Run, hosts: Hosts | None):
+    def __init__(self, run: Run, hosts: Hosts | None, forks: ForkServer):
         """``hosts`` are the other machines of the run, None where there are none."""
         self._run = run
         self._hosts = hosts
+        self._forks = forks
         self._family = Family()
 
     def recorder(self) -> Child:
@@ -136,9 +138,12 @@ class Launcher:
 
     def close(self) -> list[str]:
         """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
+        self._forks.close()
         return self._family.close()
 
     def _spawn(self, process: Process, module: str, task: bytes, mark: str = "") -> Child:
         log = self._run.log_of(process.stage, process.replica)
         log_from = log.stat().st_size if log.exists() else 0
-        return Child(process, spawn(module, task=task, log=log, mark=mark), log, log_from=log_from)
+        name = self._run.name_of(process.stage, process.replica)
+        handle = self._forks.start(module, name, task=task, log=log, mark=mark)
+        return Child(process, handle, log, log_from=log_from)

@@ -25,6 +25,7 @@ from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, L
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery
+from runner.process.fork_server import ForkServer
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
 from runner.supervise.guardian import ECHO_SECONDS, TICK_SECONDS, End, Guardian
 from runner.supervise.launch import Run
@@ -48,12 +49,13 @@ class Supervisor:
         recordings: Path,
         settings: tuple[str, ...],
         terminal: Terminal,
+        forks: ForkServer,
         steps_only: bool = False,
     ):
         """Makes the folder of the run and lists it; raises Refused where that is not possible.
 
-        ``file`` is where the graph was read from. Where it names hosts, this machine is the head. With ``steps_only``
-        no messages are recorded.
+        ``file`` is where the graph was read from. Where it names hosts, this machine is the head. ``forks`` starts the
+        processes of this machine. With ``steps_only`` no messages are recorded.
         """
         self._graph = graph
         self._terminal = terminal
@@ -83,7 +85,13 @@ class Supervisor:
         self._times, self._skipped = StageTimes(), Skipped(graph)
         self._refusals = Refusals(self._complain)
         self._guardian = Guardian(
-            run, self._hosts, terminal, say=self._say, announce=self._publish_restart, declare_lost=self._declare_lost
+            run,
+            self._hosts,
+            terminal,
+            forks,
+            say=self._say,
+            announce=self._publish_restart,
+            declare_lost=self._declare_lost,
         )
         self._numbers: dict[str, int] = defaultdict(int)
         """Next sequence number by output port of the supervisor."""

@@ -359,7 +359,7 @@ class _Model:
 
     def __init__(self, item: CatalogueObject, dof: Dof) -> None:
         self.shape = Shape.of(item.simplified(500))
-        self.proposals = Proposals(item, dof)
+        self.proposals = Proposals.of(item, dof)
         self.symmetries = item.symmetries.transforms()
         self.dof: Dof = dof
         self.normals = np.random.default_rng(0).normal(size=(_NEARBY * len(_SCALES), 6))

@@ -181,7 +181,7 @@ class ObjectFilter:
 
     def __init__(self, item: CatalogueObject, settings: FilterSettings) -> None:
         self.settings = settings
-        self.proposals = Proposals(item, settings.dof)
+        self.proposals = Proposals.of(item, settings.dof)
         self.coarse = Shape.of(item.simplified(300))
         self.fine = Shape.of(item.simplified(500))
 

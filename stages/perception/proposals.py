@@ -45,6 +45,11 @@ class Guess:
 class Proposals:
     """Pose proposals for one catalogue object; poses are P x 3 x 4 rows of T_camera_object."""
 
+    @staticmethod
+    def of(item: CatalogueObject, dof: Dof) -> Proposals:
+        """Those of an object, made once."""
+        return item.once((Proposals, dof), lambda: Proposals(item, dof))
+
     def __init__(self, item: CatalogueObject, dof: Dof) -> None:
         self.dof: Dof = dof
         self._centre = item.bounds.mean(0)

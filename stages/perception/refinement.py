@@ -163,7 +163,7 @@ class _Model:
         self.label = item.name
         self.item = item
         self.shape = Shape.of(item.simplified(settings.triangles))
-        self.proposals = Proposals(item, settings.dof)
+        self.proposals = Proposals.of(item, settings.dof)
         self.symmetries = item.symmetries.transforms(_YAW_STEP)
 
     def prepare(self) -> None:

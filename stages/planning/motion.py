@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from types import ModuleType
 from typing import Any, cast
 
 import mujoco
@@ -12,9 +15,6 @@ import numpy as np
 import ompl.base as ob
 import ompl.geometric as og
 import ompl.util as ou
-import toppra
-from toppra.algorithm import TOPPRA
-from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
 from stages.perception.poses import pose
 from stages.planning.collision import CollisionWorld, quaternion
@@ -42,6 +42,20 @@ _SPLINE_STEP = 0.05
 _SAMPLE_TIME = 0.02
 
 ou.noOutputHandler()
+
+
+def _without_plots(module: str) -> Any:
+    """Imports what would load matplotlib, which nobody here plots with and which takes a third of a second."""
+    absent = [name for name in ("matplotlib", "matplotlib.pyplot") if name not in sys.modules]
+    sys.modules.update({name: ModuleType(name) for name in absent})
+    try:
+        return importlib.import_module(module)
+    finally:
+        for name in absent:
+            del sys.modules[name]
+
+
+toppra = _without_plots("toppra")
 toppra.setup_logging("ERROR")
 
 
@@ -144,11 +158,12 @@ def time_parameterise(robot: RobotModel, waypoints: Floats, *, speed: float = 0.
     path = toppra.SplineInterpolator(arc, points, bc_type="natural")
     velocity, acceleration = robot.velocity * speed, robot.acceleration * speed
     limits = [
-        JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
-        JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
+        toppra.constraint.JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
+        toppra.constraint.JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
     ]
     grid = np.linspace(0, arc[-1], max(60, 4 * len(points)))
-    timed: Any = TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel").compute_trajectory(0, 0)
+    method = toppra.algorithm.TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel")
+    timed = method.compute_trajectory(0, 0)
     times = np.append(np.arange(0, timed.duration, _SAMPLE_TIME), timed.duration)
     return Trajectory(times, timed(times), timed(times, 1))
 

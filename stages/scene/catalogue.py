@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import fast_simplification
 import numpy as np
@@ -21,6 +22,7 @@ Faces = NDArray[np.int32]
 GraspKind = Literal["top", "side"]
 BUILT_IN = Path(__file__).with_name("catalogue.yaml")
 """The catalogue that comes with the package."""
+T = TypeVar("T")
 
 _AGGRESSIVENESS = (3.0, 5.0, 7.0)
 """Of mesh simplification: how fast its tolerance grows."""
@@ -116,12 +118,16 @@ class CatalogueObject:
 
         Quadric decimation (Garland and Heckbert 1997); each vertex takes the colour of the nearest original one.
         """
-        if triangles not in self._simplified:
-            self._simplified[triangles] = _decimated(self.mesh, triangles)
-        return self._simplified[triangles]
+        return self.once(("simplified", triangles), lambda: _decimated(self.mesh, triangles))
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make`` makes of this object, made once for all that use the object; nobody may change it."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
 
     @cached_property
-    def _simplified(self) -> dict[int, Mesh]:
+    def _made(self) -> dict[Hashable, Any]:
         return {}
 
 
@@ -141,6 +147,12 @@ class Catalogue:
         from stages.scene.loading import read_objects
 
         return Catalogue(read_objects(path))
+
+    @staticmethod
+    @cache
+    def shared(path: Path) -> Catalogue:
+        """As :meth:`load`, but read once for all stages of this process and of those that are forked from it."""
+        return Catalogue.load(path)
 
     def __getitem__(self, label: str) -> CatalogueObject:
         """The object of that name.

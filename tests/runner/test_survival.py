@@ -111,6 +111,21 @@ def test_without_its_recorder_a_graph_ends(tmp_path: Path):
     assert processes_of(tmp_path) == []
 
 
+def test_without_its_fork_server_a_graph_goes_on(tmp_path: Path):
+    process = start(DOUBLES, tmp_path, "counter.count=60", "counter.period=0.05", "sink.count=60")
+    before = read_until(process, "processes are ready")
+    (server,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[:1]
+    assert "fork_server" in Path(f"/proc/{server}/cmdline").read_text()
+    os.kill(int(server), signal.SIGKILL)
+    os.kill(pid_of(tmp_path, "doubler-0"), signal.SIGKILL)
+    ended = finish(process, tmp_path, before)
+    assert (ended.code, ended.result) == (0, [str(2 * number) for number in range(60)]), ended.output
+    assert re.search("supervisor +the fork server killed by SIGKILL; from now on every process imports", ended.output)
+    assert re.search(r"supervisor +doubler restarts \(1 of 3\): killed by SIGKILL", ended.output)
+    assert Recording(ended.recording).verdict.complete
+    assert processes_of(tmp_path) == []
+
+
 def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     calm, rough = tmp_path / "calm", tmp_path / "rough"
     calm.mkdir()

@@ -143,8 +143,9 @@ def test_recorded_categories_must_be_in_the_catalogue(tmp_path: Path) -> None:
         recorded(tmp_path, [entry(category_id=99)])
 
 
-def test_reading_a_graph_loads_neither_torch_nor_the_planners_of_motion() -> None:
-    program = "import sys, stages.detector, stages.executor; sys.exit(bool({'torch', 'toppra'} & set(sys.modules)))"
+def test_reading_a_graph_loads_neither_torch_nor_the_planners_of_motion_nor_windows() -> None:
+    program = "import sys, stages.detector, stages.executor, stages.world;"
+    program += "sys.exit(bool({'torch', 'toppra', 'glfw'} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
 
 

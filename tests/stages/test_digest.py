@@ -158,6 +158,7 @@ def test_a_posterior_depends_on_its_message_alone(seen: Rendered, filter_stage: 
     found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), false)
     (observation, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=2), frame(seen), found, filter_stage)
     posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    ParticleFilter.prepare(filter_stage.config)
     replica = ParticleFilter(filter_stage.config)
     again = [replica.on_hypothesis(h, observation, ctx) for h in reversed(hypotheses)][::-1]
     assert len(hypotheses) == 3

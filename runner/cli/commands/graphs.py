@@ -1,6 +1,7 @@
 """Commands on graph files: ``up``, ``check``, ``graph``, ``schema``."""
 
 import argparse
+import gc
 import json
 from pathlib import Path
 
@@ -25,9 +26,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _up(options: argparse.Namespace) -> int:
-    from runner.graph.graph import load_graph
-    from runner.supervise.supervisor import Supervisor
-    from runner.terminal import Terminal
+    from runner.process.forks import become_clean
     from runner.view.views import require_viewer
 
     if options.view:
@@ -35,17 +34,30 @@ def _up(options: argparse.Namespace) -> int:
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     settings = (*options.settings, *seed)
     host = None if options.here else _chosen_host(options.graph, settings, options.host)
-    terminal = Terminal()
     if host is not None:
         return _take_part(options, settings, host)
+    become_clean("runner.cli", *options.arguments)
+    return _supervise(options, settings)
+
+
+def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
+    """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
+    from runner.graph.graph import SUPERVISOR, load_graph
+    from runner.process.fork_server import ForkServer
+    from runner.supervise.supervisor import Supervisor
+    from runner.terminal import Terminal
+
+    terminal = Terminal()
+    gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, settings)
-    graph = graph.here() if options.here else graph
+    forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
-        graph,
+        graph.here() if options.here else graph,
         file=options.graph,
         recordings=options.recordings,
         settings=settings,
         terminal=terminal,
+        forks=forks,
         steps_only=options.steps_only,
     )
     end = supervisor.run(view=options.view)
@@ -69,14 +81,18 @@ def _chosen_host(file: Path, settings: tuple[str, ...], name: str | None) -> str
 def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str) -> int:
     from runner.graph.document import read_document
     from runner.hosts.agent import Agent, refuse_settings
+    from runner.process.fork_server import ForkServer
+    from runner.process.forks import become_clean
     from runner.terminal import Terminal
 
     document = read_document(options.graph)
     refuse_settings(settings, host)
     for setting in settings:
         document.set(setting)
+    become_clean("runner.cli", *options.arguments)
     terminal = Terminal()
-    end = Agent(document, host, recordings=options.recordings, terminal=terminal).run()
+    forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
+    end = Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
     terminal.plain(end.reason)
     return end.code
 

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import subprocess
 
 from runner.cli.commands import Command, Commands, add, add_file, add_settings, count
 from runner.contract import Refused
@@ -56,14 +55,13 @@ def _replay(options: argparse.Namespace) -> int:
 def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
     """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
     from runner.process.children import PARENT, die_with_parent
-    from runner.replay.forks import clean_command, is_clean
+    from runner.process.forks import call_clean, is_clean
 
     if is_clean():
         if PARENT in os.environ:
             die_with_parent()
         return command(options)
-    arguments, environment = clean_command("runner.cli", *options.arguments)
-    return subprocess.call(arguments, env=environment)
+    return call_clean("runner.cli", *options.arguments)
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -118,3 +121,11 @@ def test_the_held_object_collides_too(scene: CollisionWorld) -> None:
         with scene.resting("cereal_box"):
             assert scene.is_free(q)
     assert scene.is_free(q)
+
+
+def test_planning_motions_loads_no_plots() -> None:
+    program = (
+        "import sys, stages.planning.motion; loaded = 'matplotlib' in sys.modules; import matplotlib.pyplot as plt;"
+    )
+    program += "sys.exit(loaded or not plt.plot)"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

@@ -159,7 +159,8 @@ def test_simplified_mesh_keeps_shape_and_orientation(name: str) -> None:
 
 
 def test_simplifying_is_repeatable_and_leaves_small_meshes_alone() -> None:
-    again = Catalogue.load(BUILT_IN)["mug"].simplified(400)
+    again = Catalogue.shared(BUILT_IN)["mug"].simplified(400)
+    assert Catalogue.shared(BUILT_IN)["mug"].simplified(400) is again
     np.testing.assert_array_equal(again.vertices, CATALOGUE["mug"].simplified(400).vertices)
     np.testing.assert_array_equal(again.faces, CATALOGUE["mug"].simplified(400).faces)
     assert CATALOGUE["mug"].simplified(10**6) is CATALOGUE["mug"].mesh
