@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.accuracy import Score, score
-from benchmarks.command import command
-from benchmarks.datasets import detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import detections_file, images
 from benchmarks.estimate import Settings, estimates, results
 from runner.contract import Refused
 from stages.perception.particle_filter import IMPROVEMENTS

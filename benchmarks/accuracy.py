@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from benchmarks.command import command
-from benchmarks.datasets import ImageId, Truth, read_truth
+from benchmarks.common.command import command
+from benchmarks.common.datasets import ImageId, Truth, read_truth
 from stages.devices.bop import read_dataset
 from stages.devices.bop_results import Result, read_results
 from stages.messages.arrays import Depth, Intrinsics

@@ -21,9 +21,9 @@ import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
-from benchmarks.datasets import Image, detections_file, images
+from benchmarks.common.datasets import Image, detections_file, images
+from benchmarks.common.pipeline import Estimate
 from benchmarks.estimate import Settings, estimates
-from benchmarks.pipeline import Estimate
 from stages.devices.clutter import Pile, write_clutter
 from stages.messages import Hypothesis, Observation, SceneEstimate
 from stages.perception.depth_noise import StructuredLight
@@ -49,7 +49,7 @@ from stages.scene.catalogue import Catalogue, Floats
 Truths = NDArray[np.bool_]
 _ROOT = Path(__file__).parents[1]
 _CATALOGUE = _ROOT / "stages" / "scene" / "catalogue.yaml"
-_PLOT = _ROOT / "docs" / "figures" / "reliability.png"
+_PLOT = _ROOT / "docs" / "perception" / "figures" / "reliability.png"
 _SEEDS = {"train": 1001, "test": 3003}
 """Of the first kind of piles, the others follow; Clutter-15 has seed 0."""
 

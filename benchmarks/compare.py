@@ -12,8 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.command import command as refusing
-from benchmarks.datasets import detections_file, images, parse_wanted
+from benchmarks.common.command import command as refusing
+from benchmarks.common.datasets import detections_file, images, parse_wanted
 from benchmarks.figures import Scored, behind, draw, markdown
 from runner.contract import Refused
 from runner.process.children import ENVIRONMENT

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.accuracy import failures, right_sets, score, table
-from benchmarks.command import command
-from benchmarks.datasets import Image, ImageId, detections_file, images, parse_wanted
-from benchmarks.pipeline import Done, Estimate, Pipeline, Step, Steps
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, ImageId, detections_file, images, parse_wanted
+from benchmarks.common.pipeline import Done, Estimate, Pipeline, Step, Steps
 from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph
 from runner.process.children import ENVIRONMENT

@@ -14,8 +14,8 @@ from PIL import Image as Picture
 from PIL import ImageDraw
 
 from benchmarks.accuracy import Score, described, failed, score
-from benchmarks.command import command
-from benchmarks.datasets import Image, detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, detections_file, images
 from stages.devices.bop_results import Result, read_results
 from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, Floats

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy import BOUNDS, Score, interval, recalls, right_sets, score
-from benchmarks.command import command
-from benchmarks.datasets import Image, Truth, detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, Truth, detections_file, images
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
 from stages.scene.catalogue import Catalogue, Floats

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy import Score, score
-from benchmarks.command import command
-from benchmarks.datasets import Image, Truth, detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, Truth, detections_file, images
 from benchmarks.estimate import Settings, estimates
 from runner.contract import Level
 from stages.camera import SimulatedCamera
@@ -40,7 +40,7 @@ from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 ROOT = Path(__file__).parents[1]
 CATALOGUE = ROOT / "stages" / "scene" / "catalogue.yaml"
-FIGURE = ROOT / "docs" / "figures" / "flips.png"
+FIGURE = ROOT / "docs" / "perception" / "figures" / "flips.png"
 OWN = "simulated looks, from random flips"
 SETS = ("ycb-real", "clutter-ycb", "household-layout", "simulated")
 _SHOWN = ("soup_can", "soup_can", "tuna_can", ("sauce_bottle", "water_bottle", "milk_carton"), ("tea_box", "sugar_box"))

@@ -93,7 +93,7 @@ class Rival:
 
 
 def _rivals() -> list[Rival]:
-    from benchmarks.rasterisers import pyrender_loop, ray_casting, torch_edges
+    from benchmarks.common.rasterisers import pyrender_loop, ray_casting, torch_edges
 
     return [
         Rival("torch edge functions", torch_edges, particles=128),
@@ -127,7 +127,7 @@ class Time:
 
 def _compare(catalogue: Catalogue, width: int, triangles: int) -> None:
     """Prints a row for our kernel and for each of the others."""
-    from benchmarks.rasterisers import Task
+    from benchmarks.common.rasterisers import Task
 
     problems = [problem(catalogue[shape], width, triangles) for shape in SHAPES]
     tasks = [

@@ -17,8 +17,8 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from benchmarks.command import command
-from benchmarks.datasets import Image, detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, detections_file, images
 from runner.process.children import ENVIRONMENT
 from stages.perception.combinations import cheapest, ordered
 from stages.perception.composition import FirstLook

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import Score, score
-from benchmarks.command import command
-from benchmarks.datasets import Image, detections_file, images
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, detections_file, images
 from stages.devices.bop_results import read_results
 from stages.perception.composition import fit
 from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window

@@ -6,26 +6,40 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [
+    *(ROOT / path for path in ("README.md", "ARCHITECTURE.md", "recordings/README.md", "benchmarks/README.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 TOP_LEVEL = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")} - {"build"}
 
 
 def named_paths(text: str) -> set[str]:
-    """Every path in backticks or in a link that begins with something at the top level."""
-    candidates = re.findall(r"`([\w./*-]+)`", text) + re.findall(r"\]\(([\w./-]+)\)", text)
-    return {path for path in candidates if "/" in path and path.split("/")[0] in TOP_LEVEL}
+    """Every path in backticks that begins with something at the top level."""
+    return {path for path in re.findall(r"`([\w./*-]+)`", text) if "/" in path and path.split("/")[0] in TOP_LEVEL}
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_path_exists(document: Path):
     missing = [path for path in sorted(named_paths(document.read_text())) if not any(ROOT.glob(path.rstrip("/")))]
     assert missing == []
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_every_picture_exists(document: Path):
-    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", document.read_text()):
-        assert (document.parent / picture).is_file(), picture
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_and_picture_leads_to_a_file(document: Path):
+    for target in re.findall(r"\]\(([^):#]+)(?:#[^)]*)?\)", document.read_text()):
+        assert (document.parent / target).is_file(), target
+
+
+def test_the_index_names_every_page():
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")} - {"README.md"}
+    assert set(re.findall(r"^- \[[^]]*\]\(([\w./-]+)\)", (ROOT / "docs" / "README.md").read_text(), re.M)) == pages
+
+
+def test_the_index_of_benchmarks_names_every_command():
+    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if '"__main__"' in path.read_text()]
+    folders = [path.parent for path in (ROOT / "benchmarks").glob("*/__main__.py")]
+    named = re.findall(r"^\| `(\w+)", (ROOT / "benchmarks" / "README.md").read_text(), re.M)
+    assert {path.stem for path in (*scripts, *folders)} <= set(named)
 
 
 def test_architecture_names_every_stage():

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from benchmarks.accuracy import failures, right_sets, score, table
 from benchmarks.baselines import METHODS
-from benchmarks.command import command
-from benchmarks.datasets import Image, detections_file, images, parse_ids
+from benchmarks.common.command import command
+from benchmarks.common.datasets import Image, detections_file, images, parse_ids
 from stages.devices.bop_results import HEADER, Result
 from stages.scene.catalogue import Catalogue
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.baselines.observed import Crop, Observed
 from benchmarks.baselines.registration import Model
-from benchmarks.datasets import Image
+from benchmarks.common.datasets import Image
 from stages.messages import Candidate
 from stages.perception.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats

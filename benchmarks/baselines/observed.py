@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.datasets import Image
+from benchmarks.common.datasets import Image
 from stages.messages import Candidate
 from stages.perception.preprocessing import preprocess
 from stages.perception.rasteriser import Float32s, Soup, View, inverse_depth

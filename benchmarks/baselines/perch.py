@@ -21,7 +21,7 @@ from benchmarks.baselines.common import Box, Dof, Found, best_set
 from benchmarks.baselines.icp import best, on_plane, rotations, starts
 from benchmarks.baselines.observed import Observed
 from benchmarks.baselines.registration import Model
-from benchmarks.datasets import Image
+from benchmarks.common.datasets import Image
 from stages.perception.rasteriser import Float32s, View, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 

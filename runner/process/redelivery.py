@@ -96,12 +96,8 @@ class Redelivery:
 
     def sources_of(self, consumer: str) -> set[str]:
         """The stages that a stage gets messages from."""
-        return {
-            topic.partition("/")[0]
-            for topic, edges in self._edges.items()
-            for stage, _, _ in edges
-            if stage == consumer
-        }
+        topics = (topic for topic, edges in self._edges.items() if any(stage == consumer for stage, _, _ in edges))
+        return {topic.partition("/")[0] for topic in topics}
 
     def catch_up(self, process: Process) -> None:
         """Sends a new process all that it has to do: first what its predecessor was in the midst of, then the oldest.

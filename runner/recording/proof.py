@@ -70,7 +70,7 @@ class _Process:
 
 
 class Proof:
-    """The accounts of one recording; ``docs/recordings.md`` has the rules.
+    """The accounts of one recording; ``docs/runner/recordings.md`` has the rules.
 
     Numbers are kept as ranges: nothing grows with the recording while nothing is missing.
     """

@@ -48,6 +48,8 @@ class Child:
     dies_at: float = float("inf")
     successor: tuple[str, int] | None = None
     """Once it is dead: why it is replaced, and how often it has crashed by now."""
+    dead_since: float = float("inf")
+    """When it was found dead before it was seen."""
     reported: bool = False
     """Whether everybody has been told that it is dead."""
     unheard_since: float = float("inf")

@@ -23,6 +23,8 @@ from runner.transport.bus import Presence
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
+SEEN_SECONDS = 0.5
+"""How long it may take to hear that a process was ready that has died at once."""
 END_GRACE_SECONDS = 10.0
 """What a stage that has finished its step may take until the recorder has what it says."""
 ECHO_SECONDS = 1.0
@@ -114,6 +116,8 @@ class Guardian:
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
+            elif not child.announced and time.monotonic() < child.dead_since + SEEN_SECONDS:
+                child.dead_since = min(child.dead_since, time.monotonic())  # it may have been ready, and not seen yet
             elif child.successor is not None:
                 self._start_successor(child, *child.successor)
             elif (end := self._replace(child)) is not None:

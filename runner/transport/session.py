@@ -191,7 +191,7 @@ def _config(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
         # Every reader would have to lock the publisher's pool in memory, and without a word gets nothing where it may
-        # not; what a process reads that stands still is overwritten. See docs/performance.md.
+        # not; what a process reads that stands still is overwritten. See docs/runner/performance.md.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
         "transport/link/tx/lease": PATIENT_LEASE_MS if network is None or network.credentials is None else LEASE_MS,

@@ -1,4 +1,4 @@
-"""Tells apart, by colour, poses that look alike in depth (docs/colour.md).
+"""Tells apart, by colour, poses that look alike in depth (docs/perception/colour.md).
 
 Such poses show the same surface at every pixel, painted differently. Both paints are compared with the image in CIELAB
 after the light has been fitted: it scales lightness and chroma, and it changes lightness with the surface's normal,

@@ -1,4 +1,6 @@
-"""How sure an estimated scene is: probabilities of hypotheses and poses, spread, alternatives (docs/doubt.md).
+"""How sure an estimated scene is: probabilities of hypotheses and poses, spread, alternatives.
+
+docs/perception/doubt.md explains it.
 
 Raw weights exp(-lambda d) are far too sharp: neighbouring readings err together, and the sensor's and the model's
 biases are in no likelihood. Costs become log-odds ("nats") through scales, and evidence becomes a probability through

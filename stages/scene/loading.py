@@ -1,4 +1,4 @@
-"""Reads catalogues: our YAML format (docs/catalogue.md) and the ``models`` folders of BOP data sets."""
+"""Reads catalogues: our YAML format (docs/perception/catalogue.md) and the ``models`` folders of BOP data sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Expands the catalogue's shorthands: symmetries, resting poses, collision geometry and grasps (docs/catalogue.md)."""
+"""Expands the catalogue's shorthands: symmetries, resting poses, collision geometry and grasps.
+
+docs/perception/catalogue.md has the format.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from benchmarks.ablation import DEFAULT, PAPER, Outcome, Source, chosen, difference, row, variant, wilson
 from benchmarks.accuracy import Score
-from benchmarks.datasets import Truth
+from benchmarks.common.datasets import Truth
 from runner.contract import Refused
 from stages.perception.particle_filter import IMPROVEMENTS
 

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import accuracy
 from benchmarks.accuracy import interval, read_views, recalls, score
-from benchmarks.datasets import read_truth
+from benchmarks.common.datasets import read_truth
 from stages.devices.bop_results import HEADER, Result
 from stages.devices.clutter import write_clutter
 from stages.perception.poses import pose

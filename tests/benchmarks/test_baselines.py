@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.baselines import METHODS, fpfh
 from benchmarks.baselines.observed import Crop, Observed
-from benchmarks.datasets import Image
+from benchmarks.common.datasets import Image
 from runner.contract import Refused
 from stages.messages import Candidate, Candidates, Frame
 from stages.perception.metrics import pose_errors
@@ -106,7 +106,7 @@ def test_without_open3d_the_command_says_what_to_install(monkeypatch: pytest.Mon
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
 def test_icp_finds_every_object_of_a_layout() -> None:
-    from benchmarks.datasets import detections_file, images
+    from benchmarks.common.datasets import detections_file, images
     from stages.scene.catalogue import Catalogue
 
     dataset = DATA / "household-layout"

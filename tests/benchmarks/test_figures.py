@@ -10,7 +10,7 @@ from PIL import Image
 
 from benchmarks import compare, failures, figures
 from benchmarks.accuracy import Score
-from benchmarks.datasets import Truth, read_truth
+from benchmarks.common.datasets import Truth, read_truth
 from runner.contract import Refused
 from stages.devices.bop_results import HEADER, Result
 from stages.devices.clutter import write_clutter

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import Score
-from benchmarks.datasets import Truth
+from benchmarks.common.datasets import Truth
 from benchmarks.flips import Pair, is_flipped, looks, table
 from tests.stages.perception.scenes import CATALOGUE
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import score
-from benchmarks.datasets import detections_file, images
+from benchmarks.common.datasets import detections_file, images
 from benchmarks.truth import comparisons, line, summary
 from stages.devices.bop_results import Result
 from stages.devices.clutter import write_clutter

@@ -11,17 +11,12 @@ from runner.contract import Migration, Refused
 from runner.message.codec import CodecError, Envelope, decode_untyped, open_envelope
 from runner.recording.migrations import migrated, without_gained_fields
 from runner.recording.recording import Recording
-from runner.replay.replay import verify
 from tests.runner.recordings import rewrite
+from tests.runner.test_replay import verify
 from tests.runner.weather import MIGRATIONS, Forecast, Reading
 
 OLD = Path(__file__).with_name("weather-1.mcap")
 OTHER = {**MIGRATIONS, ("Reading", 2): Migration(change=lambda fields: {**fields, "humidity": 0.25})}
-
-
-def replay(path: Path) -> tuple[int, str]:
-    lines: list[str] = []
-    return verify(path, (), workers=1, say=lines.append), "\n".join(lines)
 
 
 def test_an_old_recording_is_read_as_messages_are_today():
@@ -34,7 +29,7 @@ def test_an_old_recording_is_read_as_messages_are_today():
 
 
 def test_an_old_recording_replays():
-    code, said = replay(OLD)
+    code, said = verify(OLD)
     assert code == 0, said
     assert "12" in said
 
@@ -43,7 +38,7 @@ def test_a_changed_value_in_an_old_recording_still_diverges(tmp_path: Path):
     mean = Recording(OLD).envelope("forecaster.forecast#3").body
     value = msgspec.msgpack.decode(mean)["celsius"][2][:8]
     path = rewrite(OLD, tmp_path / "changed.mcap", lambda _, data: data.replace(value, value[:7] + b"\x41"))
-    code, said = replay(path)
+    code, said = verify(path)
     assert code == 1
     assert "forecaster.forecast#3" in said
     assert "celsius[0]" in said

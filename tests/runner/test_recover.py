@@ -169,7 +169,7 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def recorder_of(process: subprocess.Popen[str]) -> int:
-    (recorder,) = (child for child in children(process) if "runner.process.recorder" in child.cmdline())
+    (recorder,) = (child for child in children(process) if "runner.process.recorder" in " ".join(child.cmdline()))
     return recorder.pid
 
 

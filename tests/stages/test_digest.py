@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import right_sets, score, table
-from benchmarks.datasets import ImageId, Truth, read_truth
+from benchmarks.common.datasets import ImageId, Truth, read_truth
 from benchmarks.estimate import Settings, estimate, results
 from runner.contract import Finished, Refused
 from stages.camera import DatasetCamera

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clutter import sheet
-from benchmarks.datasets import images, truths_by_image
+from benchmarks.common.datasets import images, truths_by_image
 from stages.devices.bop import read_dataset
 from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, Pile, write_clutter
 from stages.perception.rasteriser import Soup, View, inverse_depth

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from benchmarks.datasets import Image
+from benchmarks.common.datasets import Image
 from runner.contract import Level, Message, Refused
 from runner.graph.graph import Graph
 from runner.graph.ports import Handler

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.datasets import images, parse_ids, read_truth, truths_by_image
+from benchmarks.common.datasets import images, parse_ids, read_truth, truths_by_image
+from benchmarks.common.pipeline import between
 from benchmarks.estimate import Settings, bop_graph, estimate, results
-from benchmarks.pipeline import between
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
 from stages.devices.clutter import write_clutter
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.scenes import CATALOGUE
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DATA = ROOT.parent / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../shared/data are absent")
 LAYOUT = DATA / "household-layout"

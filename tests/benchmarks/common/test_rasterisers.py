@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.common.rasterisers import Task, edge_functions, pyrender_loop, torch_edges
 from benchmarks.kernel import CATALOGUE, SHAPES, problem
-from benchmarks.rasterisers import Task, edge_functions, pyrender_loop, torch_edges
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception import oracle
 

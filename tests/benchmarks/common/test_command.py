@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.command import REFUSED, command
+from benchmarks.common.command import REFUSED, command
 from runner.contract import Refused
 
 
