@@ -28,6 +28,9 @@ HANDED_ON = {
     "command[0]": "what a caller wants to be started",
     "str(self._bin / program)": "of the environment that a test has made",
     "arguments": "this interpreter again",
+    "ruff": "the extra `dev` brings it",
+    "command": "this interpreter again",
+    "typed(line)": "this interpreter again",
     "command(method, options, out)": "this interpreter again",
     "_inside(self.spaces[host], folder) if self.spaces else []": "ip",
 }
