@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.contract import Refused
-from runner.graph.placement import Credentials, Host
+from runner.graph.placement import READER, Credentials, Host
 
 Extension = tuple[x509.ExtensionType, bool]
 """What a certificate says beside names and dates, and whether who does not understand it must refuse."""
@@ -38,7 +38,8 @@ AUTHORITY = "runner network"
 
 
 def make_keys(folder: Path, hosts: Sequence[Host]) -> None:
-    """Makes an authority and a certificate for each host; raises Refused where the folder has keys already."""
+    """Makes an authority, and a certificate for each host and for who may only listen; raises Refused where the folder
+    has keys already."""
     if (folder / "ca.pem").exists() or (folder / "ca-key.pem").exists():
         raise Refused(
             f"{folder}: there are keys already and they are not overwritten; "
@@ -47,7 +48,7 @@ def make_keys(folder: Path, hosts: Sequence[Host]) -> None:
     _make_folder(folder)
     authority = _sign(AUTHORITY, days=CA_DAYS, extensions=_AUTHORITY)
     _write_pair(folder / "ca.pem", folder / "ca-key.pem", authority)
-    _add(folder, authority, hosts)
+    _add(folder, authority, [*hosts, Host(READER, "localhost")])
 
 
 def add_keys(folder: Path, hosts: Sequence[Host]) -> None:

@@ -167,7 +167,7 @@ class _Model:
         self.symmetries = item.symmetries.transforms(_YAW_STEP)
 
     def prepare(self) -> None:
-        """Makes what takes time, but for the paint: of few objects the colour is asked, and it takes 0.04 s then."""
+        """Makes what takes time, but for the paint: few objects are ever asked for their colour."""
         assert self.solid
 
     @cached_property

@@ -21,7 +21,7 @@ def test_every_host_gets_a_folder_of_its_own_that_nobody_else_reads(tmp_path: Pa
     files = [path for path in (tmp_path / "keys").rglob("*") if path.is_file()]
     assert {str(path.relative_to(tmp_path / "keys")) for path in files} == {
         *("ca.pem", "ca-key.pem"),
-        *(f"{name}/{file}" for name in ("head", "arm") for file in ("ca.pem", "cert.pem", "key.pem")),
+        *(f"{name}/{file}" for name in ("head", "arm", "reader") for file in ("ca.pem", "cert.pem", "key.pem")),
     }
     assert {path.stat().st_mode & 0o777 for path in files} == {0o600}
     assert (tmp_path / "keys" / "head").stat().st_mode & 0o777 == 0o700

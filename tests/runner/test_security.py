@@ -13,7 +13,7 @@ from runner.graph.placement import Credentials, Host, Network
 from runner.hosts.keys import add_keys, credentials, make_keys
 from runner.message.packet import Process
 from runner.transport.bus import Bus
-from runner.transport.session import Router, new_endpoint
+from runner.transport.session import Gateway, Router, new_endpoint
 from tests.runner.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")
@@ -80,7 +80,7 @@ class Peer:
     answers: list[bytes] = field(default_factory=list)
 
 
-def call_in(endpoint: str, shown: Credentials | None, trusted: str) -> zenoh.Session:
+def call_in(endpoint: str, shown: Credentials | None, trusted: str, mode: str = "peer") -> zenoh.Session:
     tls = {"root_ca_certificate": trusted}
     if shown is not None:
         tls |= {f"{side}_private_key": shown.key for side in ("listen", "connect")}
@@ -88,7 +88,8 @@ def call_in(endpoint: str, shown: Credentials | None, trusted: str) -> zenoh.Ses
         tls |= {"enable_mtls": True}
     listen = "tcp/127.0.0.1:0" if shown is None else "tls/127.0.0.1:0"
     config = zenoh.Config()
-    settings = {"mode": "peer", "connect/endpoints": [endpoint], "listen/endpoints": [listen]}
+    listened = [] if mode == "client" else [listen]
+    settings = {"mode": mode, "connect/endpoints": [endpoint], "listen/endpoints": listened}
     for key, value in {**settings, "scouting/multicast/enabled": False, "transport/link/tls": tls}.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
@@ -173,3 +174,40 @@ def test_only_the_head_gives_orders(keys: Path):
     assert set(orders) == {b"from the head"}
     for bus in (other, worker, head):
         bus.close()
+
+
+def test_who_has_the_reader_s_certificate_hears_and_says_nothing(keys: Path):
+    meeting, public = (new_endpoint("tls/127.0.0.1:0") for _ in range(2))
+    network, other = (
+        Network(name, "head", NAMES, "tls/127.0.0.1:0", False, credentials(keys, name)) for name in NAMES[:2]
+    )
+    head = Bus("run", meeting, network=network, process=Process("counter", 0), listen=True)
+    gateway = Gateway(new_endpoint(), meeting, network, public)
+    worker = Bus("run", meeting, network=other)
+    arrived: list[str] = []
+    worker.subscribe("**", lambda packet: arrived.append(packet.key))
+    heard: dict[str, list[bytes]] = {}
+    sessions: list[zenoh.Session] = []
+    for name in ("reader", "elsewhere"):
+        own = credentials(keys, name)
+        session = call_in(public, own, own.ca, mode="client")
+        sessions.append(session)
+        heard[name] = []
+        session.declare_subscriber(
+            "run/m/**", lambda sample, found=heard[name]: found.append(sample.payload.to_bytes())
+        )
+
+    def told() -> bool:
+        head.publish(NUMBER, b"number")
+        for session in sessions:
+            session.put(f"run/{PIECE}", b"piece")
+        return bool(heard["reader"]) and NUMBER in arrived
+
+    wait_until(told)
+    assert heard["elsewhere"] == []
+    assert set(arrived) == {NUMBER}
+    for session in sessions:
+        session.close()
+    worker.close()
+    gateway.close()
+    head.close()

@@ -29,7 +29,7 @@ def _add_folder(parser: argparse.ArgumentParser) -> None:
 
 
 def _init(options: argparse.Namespace) -> int:
-    from runner.graph.placement import ROUTER, read_owners
+    from runner.graph.placement import READER, ROUTER, read_owners
     from runner.hosts.keys import make_keys
     from runner.transport.security import write_router
 
@@ -41,6 +41,7 @@ def _init(options: argparse.Namespace) -> int:
         print(f"  {folder / host.name}: copy this folder to {host.name} ({host.address}), to the same place there")
     if layout.certified != layout.hosts:
         print(f"  {write_router(folder, layout)}: the configuration of {ROUTER}, for zenohd --config")
+    print(f"  {folder / READER}: for whoever may listen (`listen: tls/ADDRESS:PORT` in the graph), and do nothing else")
     print(f"  {folder / 'ca-key.pem'}: keep this here or put it away: who has it can make himself a host")
     return 0
 
