@@ -1,6 +1,6 @@
 """One process' way to the others of its run: what it publishes, hears, asks and answers, and who is present.
 
-Below the name of the run stand the keys, of which a stranger may hear all (docs/keys.md):
+Below the name of the run stand the keys, of which a stranger may hear all (docs/runner/keys.md):
 
 ==========================================  ==================================================================
 ``m/STAGE/PORT``                            every message, once (Envelope)
