@@ -14,7 +14,7 @@ config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endp
 with zenoh.open(config) as session, session.declare_subscriber(f"{run}/m/{topic}") as messages:
     print("listening", flush=True)
     for sample in messages:
-        envelope = msgpack.unpackb(sample.payload.to_bytes())  # as the JSON Schema of its topic says: `runner schema`
+        envelope = msgpack.unpackb(sample.payload.to_bytes())  # as the JSON Schema of its topic in a recording says
         shown = {
             name: value if isinstance(value, (int, float, str)) else "..." for name, value in envelope["body"].items()
         }

@@ -1,7 +1,7 @@
 """Child processes: how they are started, die with their parent, leave nothing behind and say what went wrong.
 
 As a program, ``children.py PARENT COMMAND...``, it becomes a command that dies with its parent, a process id;
-``children.py after FAMILY`` waits until stdin is closed and ends a family, see :class:`Family`.
+``children.py after NAME`` waits until stdin is closed and ends all processes of the :class:`Family` of that name.
 """
 
 import contextlib
@@ -108,8 +108,8 @@ def origin(mark: str) -> dict[str, str]:
 class Family:
     """The children of this process with all that descends from them; none of it outlives this process, even killed.
 
-    Children die by a signal from the kernel, which what they have started does not get: the family's last process ends
-    that. It waits on a pipe that closes when this process ends, in whatever way.
+    Children die by a signal from the kernel, which what they have started does not get: one more process, the last,
+    ends that. It waits on a pipe that closes when this process ends, in whatever way.
     """
 
     def __init__(self) -> None:
@@ -241,7 +241,7 @@ def ending(code: int) -> str:
 
 
 def main() -> None:
-    """Becomes the command it is given, which then dies with its parent, or the last process of a family."""
+    """Becomes the command it is given, which then dies with its parent, or the last process of a :class:`Family`."""
     if sys.argv[1] == _AFTER:
         sys.stdin.read()
         end_descendants(sys.argv[2])

@@ -20,7 +20,7 @@ def past_of(recording: Recording, stage: str, incarnation: int) -> list[Step]:
     return [past[key] for key in sorted(past)]
 
 
-def relive(node: Node, stage: Stage, seed: int, recording: Recording, steps: Iterable[Step]) -> None:
+def bring_back(node: Node, stage: Stage, seed: int, recording: Recording, steps: Iterable[Step]) -> None:
     """Executes steps and drops what they emit, so that the stage is as they left it.
 
     Raises Refused where a message that a step had consumed is not recorded.

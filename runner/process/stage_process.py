@@ -30,7 +30,7 @@ from runner.process.children import die_with_parent, explain_death, volunteer_fo
 from runner.process.delivery import Delivery, Stopped
 from runner.process.health import Heart
 from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
-from runner.process.past import past_of, relive
+from runner.process.past import bring_back, past_of
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording
 from runner.transport.bus import Bus, Peers, Presence
@@ -41,7 +41,7 @@ REMEMBERED = 10_000
 """Ids a process remembers to recognise what it is sent twice."""
 CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
-"""How long a process that ends waits for the recorder to have its steps."""
+"""How long it may take at the end until the recorder says that it has a step."""
 EXIT_FAILED = 1
 EXIT_REFUSED = 2
 
@@ -88,7 +88,7 @@ class StageProcess:
         if task.past:
             recording = Recording(Path(task.past))
             steps = past_of(recording, task.stage, task.incarnation)
-            relive(self._node, self._stage, task.seed, recording, steps)
+            bring_back(self._node, self._stage, task.seed, recording, steps)
         self._process = Process(task.stage, task.replica, task.incarnation)
         self._bus = Bus(task.run, task.endpoint, gateway=task.gateway, network=task.network, process=self._process)
         self._presence = Presence()

@@ -14,7 +14,7 @@ from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Pulses, Watch
-from runner.process.stage_process import EXIT_REFUSED
+from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
 from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Rates
@@ -27,8 +27,6 @@ SEEN_SECONDS = 0.5
 """How long it may take to hear that a process was ready that has died at once."""
 END_GRACE_SECONDS = 10.0
 """What a stage that has finished its step may take until the recorder has what it says."""
-ECHO_SECONDS = 1.0
-"""How long the recorder may take to tell of a step."""
 UNHEARD_SECONDS = 2.0
 """How long a process on another host may be without a link before it is given up and replaced."""
 RECORDER_GRACE_SECONDS = 30.0
@@ -162,7 +160,7 @@ class Guardian:
         if child.handle.poll() is None or child.reported:
             return
         if child.handle.returncode == 0 and not child.condemned and child.announced:
-            deadline = time.monotonic() + ECHO_SECONDS
+            deadline = time.monotonic() + RECORDED_SECONDS
             while child.process not in self._ended and time.monotonic() < deadline:
                 time.sleep(TICK_SECONDS / 5)
         if child.process not in self._ended:

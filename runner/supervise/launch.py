@@ -111,7 +111,7 @@ class Launcher:
 
     def _assignment(self, process: Process, progress: Progress) -> Assignment:
         run = self._run
-        relives = process.incarnation > 0 and run.remembers(process.stage)
+        has_past = process.incarnation > 0 and run.remembers(process.stage)
         return Assignment(
             run=run.id,
             endpoint=run.endpoint,
@@ -129,7 +129,7 @@ class Launcher:
             undone=tuple(progress.undone),
             gateway=run.gateway,
             network=run.network,
-            past=str(run.recording.absolute()) if relives else "",
+            past=str(run.recording.absolute()) if has_past else "",
         )
 
     def end_rest(self, process: Process) -> list[str]:

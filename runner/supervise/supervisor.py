@@ -26,8 +26,9 @@ from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery
 from runner.process.fork_server import ForkServer
+from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
-from runner.supervise.guardian import ECHO_SECONDS, TICK_SECONDS, End, Guardian
+from runner.supervise.guardian import TICK_SECONDS, End, Guardian
 from runner.supervise.launch import Run
 from runner.supervise.registry import Entry, Registration, naming, runs
 from runner.supervise.status import RunStatus, topics_of
@@ -239,7 +240,7 @@ class Supervisor:
         self._bus.publish(f"e/{self._own.path}", b"")
         self._guardian.end()
         self._journal((), "ended")
-        self._has_ended.wait(ECHO_SECONDS)
+        self._has_ended.wait(RECORDED_SECONDS)
         verdict = self._guardian.end_recorder()
         self._gateway.close()
         self._bus.close()
