@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pwd
+import re
 import signal
 import subprocess
 import sys
@@ -67,7 +68,7 @@ def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_
         heard: list[str] = []
         session.declare_subscriber(f"{run_of(before)}/m/camera/*", lambda sample: heard.append(str(sample.key_expr)))
         os.kill(stopped.pid, signal.SIGSTOP)
-        time.sleep(0.5)
+        time.sleep(1)
         (tmp_path / "go").touch()
         ended = finish(process, tmp_path, before)
         wait_until(lambda: len(heard) == 60)
@@ -77,15 +78,16 @@ def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_
 
 def test_the_example_shows_what_flows(tmp_path: Path):
     address = public_address()
-    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
-    process = start(graph, tmp_path, f"listen={address}", f"counter.go={tmp_path / 'go'}")
+    process = start(TOYS, tmp_path, f"listen={address}", "counter.count=100000", "counter.period=0.02")
     before = read_until(process, "processes are ready")
     with listening(address, run_of(before)) as listener:
-        (tmp_path / "go").touch()
         assert listener.stdout is not None
-        shown = [listener.stdout.readline() for _ in range(10)]
-        assert finish(process, tmp_path, before).code == 0
-    assert "splitter.piece#19 Piece {'index': 3, 'count': 4, 'value': 4}\n" in shown
+        shown = [listener.stdout.readline() for _ in range(50)]
+    process.terminate()
+    finish(process, tmp_path, before)
+    assert any(
+        re.fullmatch(r"splitter\.piece#\d+ Piece {'index': \d, 'count': 4, 'value': \d+}\n", one) for one in shown
+    )
 
 
 INTRUDER = """
