@@ -112,6 +112,7 @@ class StageProcess:
         self._refusals = Refusals(lambda text: self._log(text, "error"))
         self._mailbox = Mailbox(self._node)
         self._parts = Parts()
+        self._shared = {port for port in self._node.inputs if self._node.shares(port)}
         self._steps = 0
         self._recorded = threading.Condition()
         self._recorded_steps = 0
@@ -225,7 +226,7 @@ class StageProcess:
 
     def _on_message(self, port: str, packet: Packet) -> None:
         """Hands what has come to the thread that runs steps; of parts only its own."""
-        if port in self._node.inputs and self._node.shares(port):
+        if port in self._shared:
             try:
                 found = self._parts.came(port, codec.unpack(Envelope, packet.payload).id, packet)
             except CodecError:
