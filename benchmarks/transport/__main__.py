@@ -4,7 +4,8 @@ Processes of one machine: one sends an array of each size, waits for the answer,
 reads the clock in its handler. Every contender sends the same arrays at the same pace, in turns, with the same settings
 of the allocator, and starts from an array in memory: what it takes to encode is counted. The runner's recorder hears
 everything, with and without `--steps-only`, so bare Zenoh and dora-rs have a second process too that takes what comes;
-with one consumer alone they are shown as well, and Zenoh over Unix sockets, which the runner uses, beside loopback TCP.
+with one consumer alone they are shown as well. Bare Zenoh has loopback TCP and, like the runner, no shared memory; it
+is also shown over Unix sockets, which the runner uses, and with shared memory, which is on by default.
 dora-rs takes part where the extra ``benchmarks`` is installed.
 """
 
@@ -39,9 +40,10 @@ AIM = 1.5
 """What the runner may take while it records, by the median of bare Zenoh."""
 
 
-def zenoh(messages: int, folder: Path, *, protocol: str = "tcp", listeners: int = 1) -> Times:
-    """Bare Zenoh, with so many listeners besides the receiver."""
-    command = [sys.executable, "-m", "benchmarks.transport.bare_zenoh", protocol, str(listeners), str(messages)]
+def zenoh(messages: int, folder: Path, **settings: Any) -> Times:
+    """Bare Zenoh, see :class:`benchmarks.transport.bare_zenoh.Settings`."""
+    task = json.dumps({"messages": messages, **settings})
+    command = [sys.executable, "-m", "benchmarks.transport.bare_zenoh", "send", task]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=_environment())
     return json.loads(done.stdout)
 
@@ -95,6 +97,7 @@ def runner(messages: int, folder: Path, *arguments: str) -> Times:
 CONTENDERS: dict[str, Contender] = {
     BASE: zenoh,
     "bare Zenoh, Unix sockets": partial(zenoh, protocol="unixsock-stream"),
+    "bare Zenoh, shared memory": partial(zenoh, shared_memory=True),
     "bare Zenoh, one consumer": partial(zenoh, listeners=0),
     "runner": runner,
     "runner, --steps-only": lambda messages, folder: runner(messages, folder, "--steps-only"),
