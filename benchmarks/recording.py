@@ -7,10 +7,7 @@ how many of them the recording holds, its verdict, and what share of one core th
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
-import subprocess
-import sys
+import os
 import tempfile
 import time
 from collections import Counter
@@ -18,54 +15,43 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.command import command
+from benchmarks.live import process, running
+from runner.live.live import Live, wait_until_gone
+from runner.message.packet import RECORDER
 from runner.recording.recording import Recording
+
+AIM = 0.35
+"""Of a core."""
+LEAD_SECONDS = 1.0
+"""Before the processor time is read for the first time: set-up is not recording."""
 
 
 def record(folder: Path, seconds: float) -> float:
-    """Runs the graph; returns the largest share of a core that the recorder took over a second or more."""
+    """Runs the graph to its end; returns the share of a core that the recorder took."""
+    pace = {"seconds": LEAD_SECONDS + seconds}
     stages = {
-        "camera": {"stage": "benchmarks.recording_stages:Camera", "config": {"hertz": 30, "seconds": seconds}},
-        "speaker": {"stage": "benchmarks.recording_stages:Speaker", "config": {"hertz": 1000, "seconds": seconds}},
+        "camera": {"stage": "benchmarks.recording_stages:Camera", "config": {"hertz": 30, **pace}},
+        "speaker": {"stage": "benchmarks.recording_stages:Speaker", "config": {"hertz": 1000, **pace}},
     }
-    graph = folder / "graph.yaml"
-    graph.write_text(json.dumps({"name": "recording", "stages": stages}))
-    command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as run:
-        return _share(run, seconds)
-
-
-def _share(run: subprocess.Popen[bytes], seconds: float) -> float:
-    """CPU time of the recorder over wall time, from its first image on."""
-    begun: tuple[float, float] | None = None
-    share = 0.0
-    while run.poll() is None:
-        used = _recorder_seconds(run.pid)
-        now = time.monotonic()
-        if begun is None and used > 0 and list(_growing(run)):
-            begun = now, used
-        elif begun is not None and now - begun[0] < seconds:
-            share = (used - begun[1]) / (now - begun[0])
-        time.sleep(0.25)
+    with running(folder, "recording", stages) as live:
+        time.sleep(LEAD_SECONDS)
+        began, used = time.monotonic(), _used(live)
+        time.sleep(seconds - LEAD_SECONDS)
+        share = (_used(live) - used) / (time.monotonic() - began)
+        wait_until_gone(live.entry)
     return share
 
 
-def _growing(run: subprocess.Popen[bytes]) -> list[Path]:
-    """Recordings that hold images already."""
-    folder = Path(str(run.args[-1]))  # type: ignore[index]
-    return [path for path in folder.glob("*.mcap") if path.stat().st_size > 10_000_000]
+def _used(live: Live) -> float:
+    """Processor time of the recorder so far, seconds."""
+    return sum(psutil.Process(process(live.status(), RECORDER).pid).cpu_times()[:2])
 
 
-def _recorder_seconds(supervisor: int) -> float:
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for child in psutil.Process(supervisor).children():
-            if "runner.process.recorder" in child.cmdline():
-                return sum(child.cpu_times()[:2])
-    return 0.0
-
-
-def main() -> None:
-    """Prints counts, verdict and share."""
-    parser = argparse.ArgumentParser(description=__doc__)
+@command
+def main() -> int:
+    """Prints counts, verdict and share; exits 1 where something is missing or the recorder takes more than its aim."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -73,11 +59,13 @@ def main() -> None:
         (path,) = Path(folder).glob("*.mcap")
         recording = Recording(path)
         counts = Counter(message.topic for message in recording.messages.values())
-        for topic, hertz in (("camera/picture", 30), ("speaker/word", 1000)):
-            print(f"{topic:16} {counts[topic]:6} of {round(hertz * options.seconds)} recorded")
-        print(f"{recording.verdict}, {path.stat().st_size / 1e6:.0f} MB")
-        print(f"the recorder took {share:.1%} of one core")
+        size = path.stat().st_size / 1e6
+    for topic, hertz in (("camera/picture", 30), ("speaker/word", 1000)):
+        print(f"{topic:16} {counts[topic]:6} of {round(hertz * (LEAD_SECONDS + options.seconds))} recorded")
+    print(f"{recording.verdict}, {size:.0f} MB")
+    print(f"the recorder took {share:.1%} of one core (aim {AIM:.0%}), load {os.getloadavg()[0]:.1f}")
+    return int(share > AIM or not recording.verdict.complete)
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

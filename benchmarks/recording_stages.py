@@ -78,3 +78,10 @@ class Speaker(Stage):
         """Numbers."""
         for number in beats(self._pace):
             yield Word(number=number)
+
+
+class Listener(Stage):
+    """Takes words and says nothing."""
+
+    def on_word(self, word: Word) -> None:
+        """Has had it."""

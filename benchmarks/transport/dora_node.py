@@ -1,4 +1,4 @@
-"""dora-rs through its Python API, for `benchmarks.transport`: `dora run` starts this file as sender and as receiver."""
+"""dora-rs through its Python API, for `benchmarks.transport`: `dora run` starts this file for every node."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from schedule import Schedule  # type: ignore[import-not-found] - run as a file,
 _node: Any = Node()
 
 
-def receive() -> None:
-    """Answers each array with the time at which it was there."""
+def receive(role: str) -> None:
+    """Takes each array; the receiver answers it with the time at which it was there."""
     for event in _node:
         if event["type"] == "INPUT":
             event["value"].to_numpy(zero_copy_only=True)
-            _node.send_output("arrived", pa.array([time.monotonic_ns()]))
+            now = time.monotonic_ns()
+            if role == "receiver":
+                _node.send_output("arrived", pa.array([now]))
         elif event["type"] == "STOP":
             return
 
@@ -43,4 +45,4 @@ def _answer() -> int:
 
 
 if __name__ == "__main__":
-    send() if os.environ["ROLE"] == "sender" else receive()
+    send() if os.environ["ROLE"] == "sender" else receive(os.environ["ROLE"])

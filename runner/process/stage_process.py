@@ -116,6 +116,7 @@ class StageProcess:
         self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
         """What has come before the recorder has sent again what is older; None once it has."""
         self._parts = Parts()
+        self._shared = {port for port in self._node.inputs if self._node.shares(port)}
         self._steps = 0
         self._recorded = threading.Condition()
         self._recorded_steps = 0
@@ -248,7 +249,7 @@ class StageProcess:
 
     def _arrive(self, port: str, packet: Packet) -> None:
         """Hands what has come to the thread that runs steps; of parts only its own."""
-        if port in self._node.inputs and self._node.shares(port):
+        if port in self._shared:
             try:
                 found = self._parts.came(port, codec.unpack(Envelope, packet.payload).id, packet)
             except CodecError:

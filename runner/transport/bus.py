@@ -132,6 +132,7 @@ class Bus:
                 reliability=zenoh.Reliability.RELIABLE,
             )
         publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
+        os.sched_yield()  # Zenoh's thread that sends was often woken on this one's core
 
     def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
         """Calls back, in turn, for everything sent to ``path`` (``*`` and ``**`` allowed)."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from benchmarks.recording_stages import Pace, beats
 from benchmarks.starts import cold_start
 from benchmarks.transport import schedule
-from benchmarks.transport.__main__ import lines
+from benchmarks.transport.__main__ import lines, verdicts
 from benchmarks.transport.schedule import SIZES, WARM_UP, Schedule
 
 
@@ -25,9 +25,19 @@ def test_the_table_shows_medians_over_rounds_and_ratios_to_bare_zenoh():
     def times(value: float) -> dict[str, list[float]]:
         return {str(size): [value] * 3 for size in SIZES}
 
-    table = lines({"bare zenoh": [times(10), times(10), times(90)], "runner": [times(13), times(12), times(80)]})
-    assert len(table) == 1 + len(SIZES)
-    assert "13 /       13 ( 1.30x)" in table[1]
+    found = {"bare Zenoh": [times(10), times(10), times(90)], "runner": [times(13), times(12), times(80)]}
+    table = list(lines(found))
+    assert len(table) == 4
+    assert "13 /     13 (1.30)" in table[3]
+    assert list(verdicts(found)) == [f"{size:>9} bytes: 1.30 of bare Zenoh: reached (1.5)" for size in SIZES]
+
+
+def test_the_table_says_where_the_runner_is_too_slow():
+    def times(value: float) -> dict[str, list[float]]:
+        return {str(size): [value] for size in SIZES}
+
+    found = {"bare Zenoh": [times(10)], "runner": [times(16)], "dora-rs": [times(15)]}
+    assert next(verdicts(found)) == "       64 bytes: 1.60 of bare Zenoh: MISSED (1.5), BEHIND dora-rs (1.07)"
 
 
 def test_beats_come_in_number():

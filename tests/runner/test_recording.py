@@ -54,6 +54,23 @@ def number(sequence: int) -> Envelope:
 # ------------------------------------------------------------------------------------ content
 
 
+def test_the_index_at_the_end_names_every_chunk_and_grows_by_bytes_only(tmp_path: Path):
+    recorder = writer(tmp_path / "a.mcap")
+    for sequence in range(3):
+        flushed = threading.Event()
+        recorder.put(Envelope, pack(number(sequence)))
+        recorder.after_flush(flushed.set)
+        assert flushed.wait(10)
+    recorder.close()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+        found = [message.sequence for _, _, message in make_reader(file).iter_messages(topics=["counter/number"])]
+    assert summary is not None and summary.statistics is not None
+    assert len(summary.chunk_indexes) == summary.statistics.chunk_count == 3
+    assert found == [0, 1, 2]
+    assert "_Writer__chunk_indices" in vars(Writer(io.BytesIO()))  # which the recording's writer replaces
+
+
 def test_holds_every_message_and_step(toys: Path):
     recording = Recording(toys)
     assert len(recording.messages) == 51
