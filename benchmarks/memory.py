@@ -17,7 +17,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.command import command
+from benchmarks.common.command import command
 from benchmarks.live import process, running
 from runner.live.live import Live
 

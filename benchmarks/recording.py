@@ -15,7 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.command import command
+from benchmarks.common.command import command
 from benchmarks.live import process, running
 from runner.live.live import Live, wait_until_gone
 from runner.message.packet import RECORDER

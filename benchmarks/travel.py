@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from benchmarks.command import command
+from benchmarks.common.command import command
 from runner.contract import Refused
 from runner.inspect.causes import Causes
 from runner.message.codec import Step
