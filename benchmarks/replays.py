@@ -105,21 +105,22 @@ def _replays(path: Path, times: int, workers: int, settings: Sequence[str]) -> I
 def report(outcomes: Sequence[Outcome], workers: int, load: int) -> Iterator[str]:
     """The counts, then the times of the median replay."""
     middle = sorted(outcomes, key=lambda outcome: outcome.seconds)[len(outcomes) // 2]
+    wall = median(outcome.seconds for outcome in outcomes)
     identical = sum(outcome.identical for outcome in outcomes)
     counts = f"{identical} of {len(outcomes)} replays identical, {middle.messages} messages each"
     yield f"{counts}, {load} busy loops meanwhile"
     rows = (
         ("stages' compute when recorded", middle.recorded),
         (f"  shared by {workers} workers", middle.recorded / workers),
-        ("replay, wall (median)", median(outcome.seconds for outcome in outcomes)),
+        ("replay, wall (median)", wall),
         ("replay, processor time", middle.processor),
         ("  inside handlers", middle.computed),
         ("  constructing the stages", middle.constructing),
         ("  imports and all else", middle.processor - middle.computed - middle.constructing),
     )
     yield from (f"{name:<32}{seconds:8.2f} s" for name, seconds in rows)
-    yield f"{'wall / recorded compute':<32}{middle.seconds / max(middle.recorded, 1e-9):8.2f}"
-    yield f"{'wall / compute per worker':<32}{middle.seconds * workers / max(middle.recorded, 1e-9):8.2f}"
+    yield f"{'wall / recorded compute':<32}{wall / max(middle.recorded, 1e-9):8.2f}"
+    yield f"{'wall / compute per worker':<32}{wall * workers / max(middle.recorded, 1e-9):8.2f}"
 
 
 if __name__ == "__main__":
