@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -43,8 +43,8 @@ UNSEEN_SECONDS = 0.5
 """How long it may take to see a process that has died at once."""
 SAY_REST_SECONDS = 0.002
 """What may come together before it is said."""
-_Saying = Step | tuple[str, Journal | bytes | memoryview] | None
-"""A step, what else is said under which key, or the end."""
+_Saying = Step | Callable[[], None] | None
+"""A step, what else is said in its turn, or the end."""
 
 
 class Recorder:
@@ -60,7 +60,7 @@ class Recorder:
         )
         self._writer = RecordingWriter(manifest, self._complain)
         self._refusals = Refusals(self._complain)
-        self._redelivery = Redelivery(manifest.destinations, self._send_again)
+        self._redelivery = Redelivery(manifest.destinations, self._say)
         self._said: queue.SimpleQueue[_Saying] = queue.SimpleQueue()
         self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
         self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
@@ -73,6 +73,14 @@ class Recorder:
         """Their links have closed: all that they have sent has come."""
         self._lost: dict[Process, float] = {}
         """By the supervisor's word: when it is taken that all has come of those that were never seen; 0 once it has."""
+        self._takers = {
+            "m": self._on_message,
+            "s": self._on_step,
+            "l": self._on_log,
+            "x": self._on_lost,
+            "knows": self._on_knows,
+        }
+        """By the first part of a key."""
         self._heart = Heart(own, self._bus, self._vitals)
 
     def run(self) -> Verdict:
@@ -158,13 +166,11 @@ class Recorder:
         with self._changing:
             del self._lagging[process]
         self._redelivery.catch_up(process)
-        self._said.put((f"ready/{process.path}", b""))
+        self._say(f"ready/{process.path}", b"")
 
     def _take(self, packet: Packet) -> None:
         kind, _, rest = packet.key.partition("/")
-        take = {"m": self._on_message, "s": self._on_step, "l": self._on_log, "x": self._on_lost}.get(kind)
-        take = self._on_knows if kind == "knows" else take
-        if take is not None:
+        if (take := self._takers.get(kind)) is not None:
             take(rest, packet)
 
     def _on_message(self, topic: str, packet: Packet) -> None:
@@ -174,7 +180,7 @@ class Recorder:
         if not self._manifest.steps_only:
             self._writer.put(Envelope, packet.payload)
         for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
-            self._said.put((f"j/{consumer}", Journal(answered=((port, envelope.id),))))
+            self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
 
     def _on_step(self, stage: str, packet: Packet) -> None:
         """Refuses what a process says that is dead: the others know it as lost, and do its work again."""
@@ -227,12 +233,12 @@ class Recorder:
             self._lost[process] = 0
             living = list(self._present)
         self._redelivery.lost(process, living)
-        self._writer.after_flush(lambda: self._said.put((f"settled/{process.path}", b"")))
+        self._writer.after_flush(lambda: self._say(f"settled/{process.path}", b""))
 
     # ------------------------------------------------------------------------------------------ what is said
 
-    def _send_again(self, key: str, payload: bytes, may_be_dropped: bool) -> None:
-        self._said.put((key, payload) if not may_be_dropped else (key, memoryview(payload)))
+    def _say(self, key: str, payload: bytes, may_be_dropped: bool = False) -> None:
+        self._said.put(lambda: self._bus.publish(key, payload, may_be_dropped=may_be_dropped))
 
     def _say_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
@@ -248,13 +254,7 @@ class Recorder:
                     journal = Journal((saying, *_steps_after(saying, waiting)))
                     self._bus.publish(f"j/{saying.stage}", pack(journal))
                 else:
-                    self._say(*saying)
-
-    def _say(self, key: str, payload: Journal | bytes | memoryview) -> None:
-        if isinstance(payload, Journal):
-            self._bus.publish(key, pack(payload))
-        else:
-            self._bus.publish(key, bytes(payload), may_be_dropped=isinstance(payload, memoryview))
+                    saying()
 
     def _complain(self, text: str) -> None:
         """Shows and records a line."""

@@ -58,6 +58,9 @@ class Redelivery:
         self._send = send
         self._edges = {topic: dict(_edges(destinations)) for topic, destinations in topics.items()}
         self._by_place = {place: waiting for edges in self._edges.values() for place, waiting in edges.items()}
+        self._latest = [
+            (taker, waiting) for (_, taker, _), waiting in self._by_place.items() if waiting.route.policy == "latest"
+        ]
         self._open: dict[str, dict[str, tuple[str, ...]]] = {}
         """Causes of the messages, by stage and id, whose step has not come yet."""
         self._recent: OrderedDict[str, None] = OrderedDict()
@@ -123,8 +126,8 @@ class Redelivery:
     def offer_latest(self) -> None:
         """Sends the newest of each edge of policy ``latest`` again that has not been used for a while."""
         now = time.monotonic()
-        for (_, taker, _), waiting in self._by_place.items():
-            if waiting.route.policy == "latest" and waiting.messages and now > waiting.offer_at:
+        for taker, waiting in self._latest:
+            if waiting.messages and now > waiting.offer_at:
                 waiting.pause *= 2
                 waiting.offer_at = now + waiting.pause
                 self._again(taker, waiting, waiting.messages.items())
