@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import queue
 import signal
@@ -25,7 +26,7 @@ from runner.process.health import Heart
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
 from runner.recording.writer import Manifest, RecordingWriter
-from runner.transport.bus import Bus
+from runner.transport.bus import Bus, Channel, Presence
 
 TICK_SECONDS = 0.25
 """How often it is seen whether the supervisor is still there."""
@@ -65,8 +66,10 @@ class Recorder:
         self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
         self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
         self._ended = threading.Event()
+        self._channels: dict[str, Channel] = {}
+        """By what is heard; each is taken before those that come before it on a link, and worked on after them."""
         self._changing = threading.Lock()
-        self._present: set[Process] = set()
+        self._presence = Presence()
         self._lagging: dict[Process, set[tuple[str, int]]] = {}
         """Successors that have not been told yet what they have to do, and the publishers that know them."""
         self._gone: set[Process] = set()
@@ -85,12 +88,15 @@ class Recorder:
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
+        self._hear("x/*", "knows/**", "l/*", "s/*", f"m/{SUPERVISOR}/*")
         self._bus.watch(self._on_presence, self._refusals.refuse)
-        self._heard = self._bus.channel("*/**")
         self._speaker.start()
         self._taker.start()
-        self._bus.announce()
         self._heart.start()
+        if self._presence.wait_for(self._manifest.processes, self._must_end):
+            # Zenoh sends to subscribers in the order in which they came: whoever works on a message has it first.
+            self._hear(*sorted({f"m/{topic.partition('/')[0]}/*" for topic in self._manifest.topics}))
+            self._bus.announce()
         if self._wait_for_the_end():
             self._outlive()
         self._heart.stop()
@@ -101,10 +107,16 @@ class Recorder:
         self._bus.close()
         return self._writer.close()
 
+    def _hear(self, *paths: str) -> None:
+        self._channels |= {path: self._bus.channel(path) for path in paths if path not in self._channels}
+
     def stop(self, *, orphaned: bool = False) -> None:
         """Ends :meth:`run` after what has arrived; ``orphaned`` because the supervisor died. May be called from a
         signal handler."""
         self._ends.put(orphaned)
+
+    def _must_end(self) -> bool:
+        return is_orphan() or not self._ends.empty()
 
     def _wait_for_the_end(self) -> bool:
         """Returns whether the supervisor has died. A signal may reach another thread: an endless wait would miss it."""
@@ -117,7 +129,7 @@ class Recorder:
         """The stages die with the supervisor; what they have said until then is recorded."""
         signal.alarm(LAST_RESORT_SECONDS)
         deadline = time.monotonic() + ORPHANED_SECONDS
-        while self._present and time.monotonic() < deadline:
+        while self._presence.living and time.monotonic() < deadline:
             time.sleep(TICK_SECONDS / 5)
         self._writer.note_problem("the supervisor died")
 
@@ -137,8 +149,10 @@ class Recorder:
         """Takes what is there; what a process has sent that was seen to go is among it."""
         with self._changing:
             gone = [process for process in self._lost if self._has_all_of(process)]
-        for packet in self._heard.take():
-            self._take(packet)
+        heard = [list(channel.take()) for channel in list(self._channels.values())]
+        for packet in itertools.chain(*reversed(heard)):
+            kind, _, rest = packet.key.partition("/")
+            self._takers[kind](rest, packet)
         for process in gone:
             self._settle(process)
         with self._changing:
@@ -150,15 +164,15 @@ class Recorder:
     def _has_all_of(self, process: Process) -> bool:
         """Whether a lost process has just come to where nothing more can come of it."""
         due = self._lost[process]
-        unseen = process not in self._present and time.monotonic() > due
+        unseen = process not in self._presence.living and time.monotonic() > due
         return due > 0 and (process in self._gone or unseen)
 
     def _is_known(self, process: Process) -> bool:
         """Whether a process is there and all who publish what it consumes send that to it from now on."""
-        if process not in self._present:
+        if process not in self._presence.living:
             return False
         sources = self._redelivery.sources_of(process.stage)
-        publishers = {(one.stage, one.replica) for one in self._present if one.stage in sources}
+        publishers = {(one.stage, one.replica) for one in self._presence.living if one.stage in sources}
         publishers |= {(SUPERVISOR, 0)} & {(source, 0) for source in sources}
         return publishers <= self._lagging[process]
 
@@ -167,11 +181,6 @@ class Recorder:
             del self._lagging[process]
         self._redelivery.catch_up(process)
         self._say(f"ready/{process.path}", b"")
-
-    def _take(self, packet: Packet) -> None:
-        kind, _, rest = packet.key.partition("/")
-        if (take := self._takers.get(kind)) is not None:
-            take(rest, packet)
 
     def _on_message(self, topic: str, packet: Packet) -> None:
         envelope = self._refusals.read(Envelope, packet)
@@ -216,23 +225,22 @@ class Recorder:
         with self._changing:
             lagging = process in self._lagging
             self._lagging.setdefault(process, set()).add((publisher.stage, publisher.replica))
-        if not lagging and process in self._present:
+        if not lagging and process in self._presence.living:
             self._catch_up(process)  # once more, for what this one has sent meanwhile
 
     def _on_presence(self, process: Process, present: bool) -> None:
         with self._changing:
-            if present and process.incarnation and process not in self._present:
+            if present and process.incarnation and process not in self._presence.living:
                 self._lagging.setdefault(process, set())
-            (self._present.add if present else self._present.discard)(process)
             if not present:
                 self._gone.add(process)
+        self._presence.update(process, present)
 
     def _settle(self, process: Process) -> None:
         """All that a dead process has sent is here: once it is on the disk too, another one may take its place."""
         with self._changing:
             self._lost[process] = 0
-            living = list(self._present)
-        self._redelivery.lost(process, living)
+        self._redelivery.lost(process, self._presence.living)
         self._writer.after_flush(lambda: self._say(f"settled/{process.path}", b""))
 
     # ------------------------------------------------------------------------------------------ what is said

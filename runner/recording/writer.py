@@ -93,6 +93,8 @@ class Manifest(msgspec.Struct, frozen=True):
     """Record no messages."""
     destinations: dict[str, tuple[Destination, ...]] = {}
     """Where messages go, by topic."""
+    processes: tuple[tuple[str, int], ...] = ()
+    """(stage, replica) of every process of the graph."""
 
 
 def topic(kind: type[Message]) -> Topic:

@@ -94,9 +94,11 @@ class Guardian:
     # ------------------------------------------------------------------------------------------ from start to end
 
     def start_recorder(self, *, view: bool) -> None:
-        """Starts the recorder and, once that is there, the viewer if wanted."""
+        """Starts the recorder and, once there is a recording, the viewer if wanted."""
         self._recorder = self._launch.recorder()
-        if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
+        while view and not (self._run.recording.exists() or self._recorder_died()):
+            time.sleep(TICK_SECONDS)
+        if view:
             self._viewer = self._launch.viewer()
             self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
 
@@ -292,8 +294,9 @@ class Guardian:
 
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
-        now, name = time.monotonic(), self._name(child.process)
-        change = child.watch.look(now, self._pulses.of(child.process), ready=child.announced)
+        now, name, pulse = time.monotonic(), self._name(child.process), self._pulses.of(child.process)
+        waits = child is self._recorder and pulse is not None  # for all others, and is ready after them
+        change = child.watch.look(now, pulse, ready=child.announced or waits)
         if change:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):

@@ -85,6 +85,7 @@ class Launcher:
             network=run.network,
             steps_only=run.steps_only,
             destinations=run.graph.destinations(),
+            processes=tuple(run.graph.processes()),
         )
         return self._spawn(Process(RECORDER, 0), "runner.process.recorder", msgspec.json.encode(task))
 

@@ -277,21 +277,20 @@ class Presence:
     """Which processes are there, for the ready barrier."""
 
     def __init__(self):
-        self._present: set[Process] = set()
+        self.living: frozenset[Process] = frozenset()
         self._changed = threading.Condition()
 
     def update(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went."""
         with self._changed:
-            change = self._present.add if present else self._present.discard
-            change(process)
+            self.living = self.living | {process} if present else self.living - {process}
             self._changed.notify_all()
 
     def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
         """Blocks until all are present; False when ``until`` became true first."""
         wanted = set(expected)
         with self._changed:
-            while not wanted <= {(process.stage, process.replica) for process in self._present}:
+            while not wanted <= {(process.stage, process.replica) for process in self.living}:
                 if until():
                     return False
                 self._changed.wait(0.1)
