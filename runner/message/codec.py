@@ -14,6 +14,7 @@ import numpy as np
 
 from runner.contract import Level, Message, Spec
 from runner.message.ids import IdText
+from runner.message.packet import Process
 
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=msgspec.Struct)
@@ -100,6 +101,11 @@ class Step(msgspec.Struct, frozen=True):
     """(port, message id) of what has arrived and no step of this process will consume: it was refused, or put aside
     unused, or the process ended before; said once."""
 
+    @property
+    def process(self) -> Process:
+        """Whose it is."""
+        return Process(self.stage, self.replica, self.incarnation)
+
 
 class Lost(msgspec.Struct, frozen=True):
     """The supervisor's word that a process is dead, whatever else is heard of it: the one thing that makes it so."""
@@ -110,6 +116,11 @@ class Lost(msgspec.Struct, frozen=True):
     reason: str
     time_ns: Nanoseconds
     """Wall clock, nanoseconds since the epoch."""
+
+    @property
+    def process(self) -> Process:
+        """Who is dead."""
+        return Process(self.stage, self.replica, self.incarnation)
 
 
 def answered(step: Step) -> tuple[tuple[str, IdText], ...]:

@@ -5,7 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 
 from runner.graph.graph import Route
-from runner.message.codec import Envelope
+from runner.message.codec import Deal, Envelope, pack
 from runner.message.packet import Process
 
 PREFETCH = 2
@@ -14,10 +14,9 @@ POLL_SECONDS = 0.1
 PATIENCE_SECONDS = 30.0
 """A publisher that is held back for longer says so."""
 
-Give = Callable[[str, int, str, str], None]
-"""Tells a replica (stage, replica, port, message id) that a part is its own."""
+Publish = Callable[[str, bytes], None]
+"""Sends a payload under a key."""
 Warn = Callable[[str], None]
-Dealt = tuple[str, int, str, str]
 
 
 class Stopped(Exception):
@@ -71,8 +70,8 @@ class Outgoing:
         self._live.discard(replica)
         self._holders = {id: holder for id, holder in self._holders.items() if holder != replica}
 
-    def deal(self) -> Iterator[Dealt]:
-        """Gives waiting parts, in order, to the replicas that hold fewest."""
+    def deal(self) -> Iterator[tuple[str, Deal]]:
+        """Gives waiting parts, in order, to the replicas that hold fewest: (key, what the replica is told)."""
         if not self.route.shared or not self._live:
             return
         held = dict.fromkeys(sorted(self._live), 0)
@@ -85,7 +84,7 @@ class Outgoing:
             if message_id not in self._holders:
                 self._holders[message_id] = replica
                 held[replica] += 1
-                yield self.route.consumer, replica, self.route.input, message_id
+                yield f"d/{self.route.consumer}/{replica}/{self.route.input}", Deal(message_id)
 
 
 class Delivery:
@@ -93,9 +92,11 @@ class Delivery:
 
     def __init__(
         self,
+        stage: str,
         routes: Iterable[Route],
-        give: Give,
+        publish: Publish,
         warn: Warn,
+        *,
         stopping: Callable[[], bool],
         undone: Iterable[tuple[str, str, str]] = (),
     ):
@@ -103,8 +104,9 @@ class Delivery:
 
         ``undone`` are parts, (consumer, port, id), that an earlier process has sent and nobody has done with.
         """
+        self._stage = stage
         self._edges = [Outgoing(route) for route in routes]
-        self._give = give
+        self._publish = publish
         self._warn = warn
         self._changed = threading.Condition()
         self._dealing = threading.Lock()
@@ -115,14 +117,19 @@ class Delivery:
             for edge in self._edges_to(consumer, port):
                 edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
 
-    def publish(self, port: str, envelope: Envelope, send: Callable[[], None]) -> None:
-        """Sends a message once every consumer of a port has room, and deals it. Raises Stopped."""
+    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
+        """Sends a message once every consumer of a port has room, and deals it.
+
+        Raises Stopped where the graph ends meanwhile; it is sent then too.
+        """
         edges = [edge for edge in self._edges if edge.route.output == port]
-        with self._changed:
-            for edge in edges:
-                self._wait_for_room(edge, envelope.lineage)
-                edge.note(envelope.id, envelope.lineage)
-        send()
+        try:
+            with self._changed:
+                for edge in edges:
+                    self._wait_for_room(edge, envelope.lineage)
+                    edge.note(envelope.id, envelope.lineage)
+        finally:
+            self._publish(f"m/{self._stage}/{port}", payload)
         self._deal(edges)
 
     def unanswered(self) -> dict[str, int]:
@@ -170,8 +177,8 @@ class Delivery:
             for edge in edges:
                 with self._changed:
                     dealt = list(edge.deal())
-                for one in dealt:
-                    self._give(*one)
+                for key, deal in dealt:
+                    self._publish(key, pack(deal))
 
     def _wait_for_room(self, edge: Outgoing, lineage: str) -> None:
         waited = 0.0

@@ -145,9 +145,9 @@ class Inbox:
     def add(self, arrival: Arrival) -> None:
         """Takes a message; raises Mismatched for a part that contradicts its siblings."""
         handler = self._node.type.handler_of(arrival.port.name)
-        if self._node.inputs[arrival.port.name].policy == "latest":
-            self._discard_older(handler, arrival.port)
         if len(handler.inputs) == 1 and arrival.port.kind == "one":
+            if self._node.inputs[arrival.port.name].policy == "latest":
+                self._skip_older(handler, arrival.port)
             self._count(handler, arrival.port, 1)
             self._ready.append(Ready(handler, (arrival,)))
             return
@@ -223,19 +223,11 @@ class Inbox:
         if not any(lineage.waiting.values()):
             self._lineages[handler.name].pop(root, None)
 
-    def _discard_older(self, handler: Handler, port: InputPort) -> None:
-        for lineage in self._lineages[handler.name].values():
-            self._skip(handler, port, len(lineage.waiting.pop(port.name, ())))
-        if port == _turn_port(handler):
-            self._turns[handler.name].clear()
-        if len(handler.inputs) == 1:
-            kept = [ready for ready in self._ready if ready.handler is not handler]
-            self._skip(handler, port, len(self._ready) - len(kept))
-            self._ready = deque(kept)
-
-    def _skip(self, handler: Handler, port: InputPort, number: int) -> None:
-        self.skipped[port.name] += number
-        self._count(handler, port, -number)
+    def _skip_older(self, handler: Handler, port: InputPort) -> None:
+        newer = deque(ready for ready in self._ready if ready.handler is not handler)
+        skipped, self._ready = len(self._ready) - len(newer), newer
+        self.skipped[port.name] += skipped
+        self._count(handler, port, -skipped)
 
     def _count(self, handler: Handler, port: InputPort, number: int) -> None:
         if not handler.keeps(port):

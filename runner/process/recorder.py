@@ -199,7 +199,7 @@ class Recorder:
         if step.stage != stage:
             wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
-        elif self._lost.get(Process(step.stage, step.replica, step.incarnation)) != 0:
+        elif self._lost.get(step.process) != 0:
             self._writer.put(Step, packet.payload)
             self._redelivery.note_step(step)
             self._said.put(step)
@@ -212,8 +212,7 @@ class Recorder:
         if lost is not None:
             self._writer.put(Lost, packet.payload)
             with self._changing:
-                process = Process(lost.stage, lost.replica, lost.incarnation)
-                self._lost.setdefault(process, time.monotonic() + UNSEEN_SECONDS)
+                self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
 
     def _on_knows(self, path: str, packet: Packet) -> None:
         """A publisher sends to a successor from now on; what it has sent before is here."""

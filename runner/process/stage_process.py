@@ -95,7 +95,14 @@ class StageProcess:
         self._peers = Peers()
         self._stopping = threading.Event()
         self._retiring = threading.Event()
-        self._delivery = Delivery(task.routes, self._give, self._warn, self._stopping.is_set, task.undone)
+        self._delivery = Delivery(
+            task.stage,
+            task.routes,
+            self._bus.publish,
+            self._warn,
+            stopping=self._stopping.is_set,
+            undone=task.undone,
+        )
         self._inbox = Inbox(self._node)
         self._executor = Executor(
             self._node,
@@ -208,9 +215,8 @@ class StageProcess:
     def _on_lost(self, packet: Packet) -> None:
         lost = self._refusals.read(Lost, packet)
         if lost is not None:
-            process = Process(lost.stage, lost.replica, lost.incarnation)
-            self._peers.ended(process)
-            self._delivery.lost(process)
+            self._peers.ended(lost.process)
+            self._delivery.lost(lost.process)
 
     def _on_end(self, packet: Packet) -> None:
         try:
@@ -227,7 +233,7 @@ class StageProcess:
             self._delivery.answered(consumer, done)
             if consumer == self._process.stage:
                 self._parts.forget(done)
-        own = [step for step in journal.steps if Process(step.stage, step.replica, step.incarnation) == self._process]
+        own = [step for step in journal.steps if step.process == self._process]
         if own:
             with self._recorded:
                 self._recorded_steps = own[-1].number + 1
@@ -262,9 +268,6 @@ class StageProcess:
         deal = self._refusals.read(Deal, packet)
         if deal is not None and (part := self._parts.deal(packet.end, deal.id)) is not None:
             self._mailbox.put(packet.end, part)
-
-    def _give(self, stage: str, replica: int, port: str, id: str) -> None:
-        self._bus.publish(f"d/{stage}/{replica}/{port}", codec.pack(Deal(id)))
 
     def _take(self, name: str, packet: Packet) -> None:
         """Decodes one message into the inbox, unless it has been here before."""
@@ -354,20 +357,12 @@ class StageProcess:
             yield True
 
     def _emit(self, draft: Draft) -> None:
-        """Sends a message once its consumers have room; also where the graph ends meanwhile."""
+        """Sends a message once its consumers have room."""
         envelope, payload = draft.cover, b"".join(draft.parts())
         port = MessageId.of(envelope.id).port
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
-
-        def send() -> None:
-            self._bus.publish(f"m/{self._process.stage}/{port}", payload)
-
-        try:
-            self._delivery.publish(port, envelope, send)
-        except Stopped:
-            send()
-            raise
+        self._delivery.publish(port, envelope, payload)
 
     def _journal(self, record: "_Record") -> None:
         left, self._left = (*self._left, *self._inbox.take_unused()), []
@@ -387,24 +382,9 @@ class StageProcess:
             self._say_what_is_left()
             left = (*self._inbox.left(), *self._parts.left())
         left = (*self._left, *self._inbox.take_unused(), *left)
-        own = self._process
+        own, now_ns = self._process, time.time_ns()
         self._publish_step(
-            Step(
-                own.stage,
-                own.replica,
-                own.incarnation,
-                self._steps,
-                "",
-                (),
-                (),
-                time.time_ns(),
-                0,
-                0,
-                0,
-                "ended",
-                "",
-                left,
-            )
+            Step(own.stage, own.replica, own.incarnation, self._steps, "", (), (), now_ns, 0, 0, 0, "ended", left=left)
         )
 
     def _say_what_is_left(self) -> None:

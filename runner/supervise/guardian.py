@@ -181,9 +181,8 @@ class Guardian:
 
     def note_step(self, step: Step) -> None:
         """Takes a step that the recorder has."""
-        process = Process(step.stage, step.replica, step.incarnation)
         if step.outcome == "ended":
-            self._ended.add(process)
+            self._ended.add(step.process)
         self._progress[step.stage].note(step, self._progress)
         for port, id in answered(step):
             if (edge := self._graph.nodes[step.stage].inputs.get(port)) is not None:

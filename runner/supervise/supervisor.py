@@ -21,7 +21,7 @@ from runner.hosts.head import Hosts
 from runner.inspect.info import StageTimes
 from runner.inspect.skipped import Skipped
 from runner.message import codec
-from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery
@@ -81,7 +81,9 @@ class Supervisor:
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
         self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
-        self._delivery = Delivery(graph.routes(SUPERVISOR), self._give, self._warn, self._stopping.is_set)
+        self._delivery = Delivery(
+            SUPERVISOR, graph.routes(SUPERVISOR), self._bus.publish, self._warn, stopping=self._stopping.is_set
+        )
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
         self._times, self._skipped = StageTimes(), Skipped(graph)
         self._refusals = Refusals(self._complain)
@@ -210,9 +212,8 @@ class Supervisor:
             self._numbers[port] += 1
         say(own)
         envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
-        payload = codec.pack(envelope)
         try:
-            self._delivery.publish(port, envelope, lambda: self._bus.publish(f"m/{SUPERVISOR}/{port}", payload))
+            self._delivery.publish(port, envelope, codec.pack(envelope))
         finally:
             self._journal((own,))
 
@@ -227,9 +228,6 @@ class Supervisor:
         lost = Lost(process.stage, process.replica, process.incarnation, reason, time.time_ns())
         self._bus.publish(f"x/{process.stage}", codec.pack(lost))
         self._delivery.lost(process)
-
-    def _give(self, stage: str, replica: int, port: str, id: str) -> None:
-        self._bus.publish(f"d/{stage}/{replica}/{port}", codec.pack(Deal(id)))
 
     # ------------------------------------------------------------------------------------------ the end
 

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from runner.graph.graph import Route
-from runner.message.codec import Envelope
+from runner.message.codec import Deal, Envelope, unpack
 from runner.message.packet import Process
 from runner.process.delivery import PREFETCH, Delivery, Stopped
 
@@ -21,10 +21,15 @@ class Wire:
         self.stopping = threading.Event()
         self.standing_still = threading.Lock()
 
-    def give(self, stage: str, replica: int, port: str, id: str) -> None:
-        assert (stage, port) == ("worker", "input")
-        with self.standing_still:
-            self.dealt.append((replica, id))
+    def publish(self, key: str, payload: bytes) -> None:
+        match key.split("/"):
+            case ["m", "counter", "number"]:
+                self.sent.append(payload.decode())
+            case ["d", "worker", replica, "input"]:
+                with self.standing_still:
+                    self.dealt.append((int(replica), unpack(Deal, payload).id))
+            case _:
+                raise AssertionError(key)
 
     def take(self) -> list[tuple[int, str]]:
         dealt, self.dealt = self.dealt, []
@@ -35,14 +40,15 @@ def make(undone: tuple[tuple[str, str, str], ...] = (), **changes: Any) -> tuple
     route = Route("number", "worker", "input", "block", queue=4, shared=False, kept=0)
     wire = Wire()
     routes = [msgspec.structs.replace(route, **changes)]
-    return Delivery(routes, wire.give, lambda _: None, wire.stopping.is_set, undone), wire
+    stopping = wire.stopping.is_set
+    return Delivery("counter", routes, wire.publish, lambda _: None, stopping=stopping, undone=undone), wire
 
 
 def publish(delivery: Delivery, wire: Wire, number: int, lineage: int | None = None) -> str:
     own = f"counter.number#{number}"
     root = own if lineage is None else f"counter.number#{lineage}"
     cover = Envelope(own, root, 0, "Number", 1, (), msgspec.Raw(b""))
-    delivery.publish("number", cover, lambda: wire.sent.append(own))
+    delivery.publish("number", cover, own.encode())
     return own
 
 
@@ -124,6 +130,7 @@ def test_stopping_frees_a_blocked_publisher():
     threading.Timer(0.1, wire.stopping.set).start()
     with pytest.raises(Stopped):
         publish(delivery, wire, 1)
+    assert len(wire.sent) == 2
 
 
 def test_an_edge_of_policy_latest_never_blocks():
