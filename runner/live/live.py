@@ -18,7 +18,7 @@ from runner.message.packet import Packet
 from runner.supervise.calls import CallQuestion, CallRequest, CommandType, Progress
 from runner.supervise.registry import Entry, is_alive
 from runner.supervise.status import RunStatus
-from runner.transport.bus import Listener
+from runner.transport.bus import Bus
 
 T = TypeVar("T")
 ANSWER_SECONDS = 10.0
@@ -52,7 +52,7 @@ class Header(NamedTuple):
 class Backlog:
     """What a terminal has still to show of some messages."""
 
-    def __init__(self, bus: Listener, path: str) -> None:
+    def __init__(self, bus: Bus, path: str) -> None:
         self._packets: queue.Queue[Packet] = queue.Queue(BACKLOG)
         bus.hand_over(path, self._receive)
 
@@ -75,7 +75,7 @@ class Live:
         """Raises Refused where the run does not answer any more."""
         self.entry = entry
         try:
-            self.bus = Listener(entry.run, entry.gateway)
+            self.bus = Bus(entry.run, entry.gateway, client=True)
         except Refused as refusal:
             raise Refused(f"{entry.run}: cannot be reached: {refusal}") from None
 

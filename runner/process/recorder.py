@@ -26,7 +26,8 @@ from runner.process.health import Heart
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
 from runner.recording.writer import Manifest, RecordingWriter
-from runner.transport.bus import Bus, Channel, Presence
+from runner.transport.bus import Bus, Channel
+from runner.transport.presence import Presence
 
 TICK_SECONDS = 0.25
 """How often it is seen whether the supervisor is still there."""

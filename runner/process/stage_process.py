@@ -33,7 +33,8 @@ from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
 from runner.process.past import bring_back, past_of
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording
-from runner.transport.bus import Bus, Peers, Presence
+from runner.transport.bus import Bus
+from runner.transport.presence import Peers, Presence
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""

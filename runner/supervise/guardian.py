@@ -19,7 +19,7 @@ from runner.supervise.child import Child, Progress, end_all, signal_all, wait_fo
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Rates
 from runner.terminal import Terminal
-from runner.transport.bus import Presence
+from runner.transport.presence import Presence
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""

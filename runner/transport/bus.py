@@ -34,7 +34,7 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,7 +42,6 @@ import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
 from runner.contract import Refused
-from runner.graph.graph import SUPERVISOR
 from runner.graph.placement import Network
 from runner.message.packet import Packet, Process
 from runner.transport.session import (
@@ -92,25 +91,23 @@ class Bus:
         network: Network | None = None,
         process: Process | None = None,
         listen: bool = False,
+        client: bool = False,
     ):
         """Calls at ``endpoint``, or with ``listen`` is the one who is called there, and at the run's ``gateway``.
 
-        ``process`` is who this is. Raises Refused where this machine cannot listen as it is told.
+        ``process`` is who this is. As a ``client`` it is called by nobody: a tool, which listens at a gateway. Raises
+        Refused where this machine cannot listen as it is told, or nobody takes a client's call.
         """
         self._run = run
         self._process = process
-        self._gateway = gateway
+        self._gateway = gateway if network is None else ""
         self._far = network is not None
-        routed = network is not None and network.routed
-        own = endpoint if listen else new_endpoint(endpoint) if network is None else private(network.listen)
-        calls = [] if listen else [endpoint]
-        if gateway and network is None:
-            calls.append(gateway)
-        mode = "client" if routed else "peer"
-        self._open([] if routed else [own], calls, network, mode)
-
-    def _open(self, listen: list[str], connect: list[str], network: Network | None, mode: str) -> None:
-        self._session = open_session(listen, connect, network, mode=mode)
+        calls = [*([] if listen else [endpoint]), *filter(None, [self._gateway])]
+        if client or (network is not None and network.routed):
+            self._session = open_session([], calls, network, mode="client")
+        else:
+            own = endpoint if listen else new_endpoint(endpoint) if network is None else private(network.listen)
+            self._session = open_session([own], calls, network)
         self._listener: zenoh.Session | None = None
         self._declared: list[zenoh.Subscriber[Any] | zenoh.LivelinessToken | zenoh.Queryable[None]] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -145,7 +142,7 @@ class Bus:
     def overhear(self, path: str, take: Callable[[Packet], None]) -> None:
         """Does the same at the gateway, where there is one on this machine: what this process does not take in time is
         dropped, and nobody waits."""
-        if self._listener is None and self._gateway and not self._far:
+        if self._listener is None and self._gateway:
             self._listener = open_session([], [self._gateway], None, mode="client")
         self._declare(self._listener or self._session, path, self._taker(take))
 
@@ -249,17 +246,6 @@ class Bus:
             os._exit(1)
 
 
-class Listener(Bus):
-    """A tool's connection to the gateway of a run: it hears and asks, and holds nobody up."""
-
-    def __init__(self, run: str, gateway: str):
-        """Raises Refused where nobody takes the call."""
-        self._run = run
-        self._process = None
-        self._far = False
-        self._open([], [gateway], None, "client")
-
-
 class Channel:
     """What has been sent to one process and waits to be taken."""
 
@@ -271,66 +257,6 @@ class Channel:
         """All that is there."""
         while (sample := self._subscriber.try_recv()) is not None:
             yield self._packet(sample)
-
-
-class Presence:
-    """Which processes are there, for the ready barrier."""
-
-    def __init__(self):
-        self.living: frozenset[Process] = frozenset()
-        self._changed = threading.Condition()
-
-    def update(self, process: Process, present: bool) -> None:
-        """Takes note of a process that came or went."""
-        with self._changed:
-            self.living = self.living | {process} if present else self.living - {process}
-            self._changed.notify_all()
-
-    def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
-        """Blocks until all are present; False when ``until`` became true first."""
-        wanted = set(expected)
-        with self._changed:
-            while not wanted <= {(process.stage, process.replica) for process in self.living}:
-                if until():
-                    return False
-                self._changed.wait(0.1)
-        return True
-
-
-END_SECONDS = 8.0
-"""How long a process that ends waits at most for the others to publish no more."""
-
-
-class Peers:
-    """Which processes of a run publish no more: they have ended, or are dead."""
-
-    def __init__(self) -> None:
-        self._newest: dict[tuple[str, int], int] = {}
-        self._ended: dict[tuple[str, int], int] = {}
-        """Incarnation by (stage, replica)."""
-        self._changed = threading.Condition()
-
-    def appeared(self, process: Process) -> None:
-        """Takes note of a process that is there."""
-        with self._changed:
-            place = process.stage, process.replica
-            self._newest[place] = max(process.incarnation, self._newest.get(place, 0))
-
-    def ended(self, process: Process) -> None:
-        """Takes note of one that has ended."""
-        with self._changed:
-            place = process.stage, process.replica
-            self._ended[place] = max(process.incarnation, self._ended.get(place, 0))
-            self._changed.notify_all()
-
-    def wait_for(self, stages: Collection[str], processes: Iterable[tuple[str, int]]) -> None:
-        """Waits until nothing more comes from these stages, whose ``processes`` are (stage, replica)."""
-        wanted = {place for place in (*processes, (SUPERVISOR, 0)) if place[0] in stages}
-        with self._changed:
-            self._changed.wait_for(lambda: all(map(self._has_ended, wanted)), END_SECONDS)
-
-    def _has_ended(self, place: tuple[str, int]) -> bool:
-        return self._ended.get(place, -1) >= self._newest.get(place, 0)
 
 
 def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:

@@ -23,7 +23,8 @@ from runner.process.children import last_lines, spawn
 from runner.process.stage_process import Assignment
 from runner.recording.recording import Recording
 from runner.recording.writer import Manifest
-from runner.transport.bus import Bus, Presence
+from runner.transport.bus import Bus
+from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
 from tests.runner.survivors import Picture
 from tests.runner.test_runs import ALBUM, TOYS, changed, finish, meeting_of, processes_of, read_until, run, start

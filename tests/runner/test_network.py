@@ -18,7 +18,8 @@ from runner.graph.placement import Host, Layout, read_layout, read_owners
 from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, differences, moved
 from runner.message.packet import Process
 from runner.transport import bus
-from runner.transport.bus import Bus, Presence
+from runner.transport.bus import Bus
+from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
 from tests.runner.machines import HOSTS, free_address
 from tests.runner.test_runs import DOUBLES, finish, read_until, start

@@ -19,7 +19,8 @@ from runner.process.children import last_lines, spawn
 from runner.process.recorder import EXIT_INCOMPLETE, EXIT_REFUSED
 from runner.recording.recording import Recording
 from runner.recording.writer import Manifest, topic
-from runner.transport.bus import Bus, Presence
+from runner.transport.bus import Bus
+from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
 from tests.runner.waiting import wait_until
 

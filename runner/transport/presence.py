@@ -1,0 +1,66 @@
+"""Which processes of a run are there, and which publish no more."""
+
+import threading
+from collections.abc import Callable, Collection, Iterable
+
+from runner.graph.graph import SUPERVISOR
+from runner.message.packet import Process
+
+END_SECONDS = 8.0
+"""How long a process that ends waits at most for the others to publish no more."""
+
+
+class Presence:
+    """Which processes are there, for the ready barrier."""
+
+    def __init__(self):
+        self.living: frozenset[Process] = frozenset()
+        self._changed = threading.Condition()
+
+    def update(self, process: Process, present: bool) -> None:
+        """Takes note of a process that came or went."""
+        with self._changed:
+            self.living = self.living | {process} if present else self.living - {process}
+            self._changed.notify_all()
+
+    def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
+        """Blocks until all are present; False when ``until`` became true first."""
+        wanted = set(expected)
+        with self._changed:
+            while not wanted <= {(process.stage, process.replica) for process in self.living}:
+                if until():
+                    return False
+                self._changed.wait(0.1)
+        return True
+
+
+class Peers:
+    """Which processes of a run publish no more: they have ended, or are dead."""
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[str, int], int] = {}
+        self._ended: dict[tuple[str, int], int] = {}
+        """Incarnation by (stage, replica)."""
+        self._changed = threading.Condition()
+
+    def appeared(self, process: Process) -> None:
+        """Takes note of a process that is there."""
+        with self._changed:
+            place = process.stage, process.replica
+            self._newest[place] = max(process.incarnation, self._newest.get(place, 0))
+
+    def ended(self, process: Process) -> None:
+        """Takes note of one that has ended."""
+        with self._changed:
+            place = process.stage, process.replica
+            self._ended[place] = max(process.incarnation, self._ended.get(place, 0))
+            self._changed.notify_all()
+
+    def wait_for(self, stages: Collection[str], processes: Iterable[tuple[str, int]]) -> None:
+        """Waits until nothing more comes from these stages, whose ``processes`` are (stage, replica)."""
+        wanted = {place for place in (*processes, (SUPERVISOR, 0)) if place[0] in stages}
+        with self._changed:
+            self._changed.wait_for(lambda: all(map(self._has_ended, wanted)), END_SECONDS)
+
+    def _has_ended(self, place: tuple[str, int]) -> bool:
+        return self._ended.get(place, -1) >= self._newest.get(place, 0)
