@@ -1,14 +1,20 @@
 """The main job as a user runs it: shown, disturbed, restored, with a particle filter killed at work, then replayed."""
 
+import hashlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from runner.message.codec import pack
+from runner.recording.recording import Recording
+from tests.runner.test_bad_input import public_address, stranger
 
 ROOT = Path(__file__).parent.parent
 RUNNER = (sys.executable, "-m", "runner.cli")
@@ -61,3 +67,35 @@ def test_a_scene_is_restored_though_a_particle_filter_is_killed_and_replays_to_t
     )
     assert replay.returncode == 0, replay.stdout + replay.stderr
     assert "IDENTICAL" in replay.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_zenoh_subscriber_hears_every_message_of_the_job_once_and_byte_for_byte(tmp_path: Path) -> None:
+    address = public_address()
+    settings = ("--set", "world.seed=3", "--set", f"listen={address}", "--recordings", str(tmp_path))
+    heard: Counter[tuple[str, str]] = Counter()
+    with subprocess.Popen((*RUNNER, "up", "graph.yaml", *settings), cwd=ROOT, stdout=subprocess.PIPE, text=True) as job:
+        lines = lines_of(job)
+        printed = [next(lines)]
+        with stranger(address) as session:
+            session.declare_subscriber(
+                "**", lambda sample: heard.update([(str(sample.key_expr), digest(sample.payload.to_bytes()))])
+            )
+            printed += lines
+    assert job.returncode == 0, "\n".join(printed)
+    (path,) = tmp_path.glob("tray-*.mcap")
+    recording = Recording(path)
+    assert recording.verdict.complete
+    recorded = Counter(
+        (f"{path.stem}/m/{recording.messages[one.id].topic}", digest(pack(one))) for one in recording.envelopes()
+    )
+    messages = Counter({one: count for one, count in heard.items() if "/m/" in one[0]})
+    assert set(recorded.values()) == {1}
+    assert messages == recorded
+    assert {digest(pack(step)) for step in recording.steps} <= {text for key, text in heard if "/s/" in key}
+
+
+def digest(payload: bytes) -> str:
+    """Stands for the bytes of a message."""
+    return hashlib.sha256(payload).hexdigest()

@@ -13,7 +13,7 @@ from runner.graph.placement import Host
 from runner.hosts.keys import make_keys
 from runner.recording.recording import Recording
 from tests.runner.machines import HOSTS, NAMES, Machines, Party, free_address, in_namespaces, on_loopback, run_here
-from tests.runner.test_runs import Run, processes_of, read_until
+from tests.runner.test_runs import Run, changed, processes_of, read_until
 from tests.runner.waiting import wait_until
 
 SUMS = """
@@ -188,6 +188,26 @@ def test_a_stateful_stage_gets_its_state_back_on_its_host(parties, tmp_path: Pat
         assert head.code == 0, head.output
         results.append((folder / "out.txt").read_text())
     assert (results[0], head.output.count("adder restarts")) == (results[1], 2)
+
+
+@pytest.mark.slow
+def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_path: Path):
+    """Killed between what it journals and what it sends, again and again: the replicas of each host get all parts."""
+    graph = changed(HOSTS, tmp_path, Splitter="FragileSplitter")
+    results: list[str] = []
+    for name in ("calm", "rough"):
+        folder = tmp_path / name
+        folder.mkdir()
+        if name == "calm":
+            for number in range(20):
+                (folder / str(number)).touch()
+        party = parties(on_loopback(), folder, graph=graph)
+        party.start_all("counter.count=20", f"splitter.marks={folder}", "splitter.restarts=20")
+        head = party.end("head")
+        assert head.code == 0, head.output
+        assert Recording(head.recording).verdict.complete
+        results.append((folder / "out.txt").read_text())
+    assert (results[0], head.output.count("splitter restarts (")) == (results[1], 10)
 
 
 @pytest.mark.slow

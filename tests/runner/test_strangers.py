@@ -14,8 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from runner.hosts.head import control
 from runner.message.codec import pack
 from runner.recording.recording import Recording
+from runner.transport.session import private
+from tests.runner.machines import Party, on_loopback
 from tests.runner.test_bad_input import public_address, run_of, stranger
 from tests.runner.test_runs import ALBUM, HERE, TOYS, changed, finish, meeting_of, read_until, start
 from tests.runner.waiting import wait_until
@@ -106,20 +109,44 @@ except zenoh.ZError:
 """
 
 
-def test_another_user_of_the_machine_comes_in_nowhere(tmp_path: Path):
+def comes_in(endpoint: str, run: str, user: int) -> bool:
+    """Whether a process of some user can call at an endpoint."""
+    command = [sys.executable, "-c", INTRUDER, str(user), endpoint, run]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return {"in": True, "out": False}[done.stdout.strip()]
+
+
+@pytest.fixture
+def other_user() -> int:
     if os.getuid() != 0:
         pytest.skip("needs the right to become another user")
+    return pwd.getpwnam("nobody").pw_uid
+
+
+def test_another_user_of_the_machine_comes_in_nowhere(tmp_path: Path, other_user: int):
     graph = changed(TOYS, tmp_path, Counter="GatedCounter")
     process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}")
     before = read_until(process, "processes are ready")
     gateway = before.partition(" on ")[2].split()[0]
-    found: dict[str, set[str]] = {}
-    for user in (str(os.getuid()), str(pwd.getpwnam("nobody").pw_uid)):
-        for endpoint in (gateway, meeting_of(gateway)):
-            command = [sys.executable, "-c", INTRUDER, user, endpoint, run_of(before)]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-            found.setdefault(user, set()).add(done.stdout.strip())
+    endpoints = (gateway, meeting_of(gateway))
+    assert [comes_in(endpoint, run_of(before), os.getuid()) for endpoint in endpoints] == [True, True]
+    assert [comes_in(endpoint, run_of(before), other_user) for endpoint in endpoints] == [False, False]
     (tmp_path / "go").touch()
     ended = finish(process, tmp_path, before)
-    assert list(found.values()) == [{"in"}, {"out"}]
     assert ended.code == 0, ended.output
+
+
+@pytest.mark.slow
+def test_another_user_of_the_machine_has_no_agent_start_anything(tmp_path: Path, other_user: int):
+    """Hosts without keys, all on loopback, meet where the head's address is written: at a socket of their user."""
+    machines = on_loopback()
+    party = Party(machines, tmp_path).start_all("counter.count=100", "counter.period=0.1")
+    try:
+        before = read_until(party.hosts["head"], "processes are ready")
+        address = f"tcp/{machines.addresses['head']}"
+        assert comes_in(private(address), control("hosts"), os.getuid())
+        assert not comes_in(private(address), control("hosts"), other_user)
+        assert not comes_in(address, control("hosts"), os.getuid())
+        assert party.end("head", before).code == 0
+    finally:
+        party.close()
