@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from runner.graph.graph import Limits
 from runner.message import codec
 from runner.message.codec import Pulse
@@ -22,7 +24,6 @@ LONGEST_LOOK_SECONDS = 1.0
 """What may count as waited between two looks: while the supervisor itself stands still, nobody is to blame."""
 SOURCE = "source"
 """Waits for the world as long as it likes."""
-_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 class Heart:
@@ -33,6 +34,7 @@ class Heart:
         self._process = process
         self._bus = bus
         self._say = say
+        self._facts = psutil.Process()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="pulse", daemon=True)
 
@@ -62,7 +64,7 @@ class Heart:
             pid=os.getpid(),
             host=platform.node(),
             cpu_ns=time.process_time_ns(),
-            memory_bytes=memory_bytes(),
+            memory_bytes=self._facts.memory_info().rss,
             **self._say(),
         )
 
@@ -159,11 +161,3 @@ def _own_groups() -> Iterator[Path]:
                 yield Path(f"/sys/fs/cgroup{group}/memory.events")
             elif "memory" in controllers.split(","):
                 yield Path(f"/sys/fs/cgroup/memory{group}/memory.oom_control")
-
-
-def memory_bytes() -> int:
-    """The resident set of this process; 0 where the system does not tell."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_BYTES
-    except OSError:
-        return 0

@@ -34,7 +34,7 @@ from runner.process.past import bring_back, past_of
 from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording
 from runner.transport.bus import Bus
-from runner.transport.presence import Peers, Presence
+from runner.transport.presence import Presence
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
@@ -93,7 +93,6 @@ class StageProcess:
         self._process = Process(task.stage, task.replica, task.incarnation)
         self._bus = Bus(task.run, task.endpoint, gateway=task.gateway, network=task.network, process=self._process)
         self._presence = Presence()
-        self._peers = Peers()
         self._stopping = threading.Event()
         self._retiring = threading.Event()
         self._delivery = Delivery(
@@ -208,7 +207,6 @@ class StageProcess:
             os._exit(EXIT_FAILED)
         self._presence.update(process, present)
         if present:
-            self._peers.appeared(process)
             self._delivery.appeared(process)
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
@@ -216,12 +214,12 @@ class StageProcess:
     def _on_lost(self, packet: Packet) -> None:
         lost = self._refusals.read(Lost, packet)
         if lost is not None:
-            self._peers.ended(lost.process)
+            self._presence.ended(lost.process)
             self._delivery.lost(lost.process)
 
     def _on_end(self, packet: Packet) -> None:
         try:
-            self._peers.ended(Process.of(packet.key))
+            self._presence.ended(Process.of(packet.key))
         except Refused as refusal:
             self._refusals.refuse(packet.key, refusal)
 
@@ -378,7 +376,7 @@ class StageProcess:
         left: Iterable[tuple[str, str]] = ()
         if not self._retiring.is_set():
             self._bus.publish(f"e/{self._process.path}", b"")
-            self._peers.wait_for({edge.stage for edge in self._node.inputs.values()}, self._task.processes)
+            self._presence.wait_for_the_end({edge.stage for edge in self._node.inputs.values()}, self._task.processes)
             self._take_all(wait=False)
             self._say_what_is_left()
             left = (*self._inbox.left(), *self._parts.left())

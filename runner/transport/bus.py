@@ -1,25 +1,6 @@
 """One process' way to the others of its run: what it publishes, hears, asks and answers, and who is present.
 
-Below the name of the run stand the keys, of which a stranger may hear all (docs/runner/keys.md):
-
-==========================================  ==================================================================
-``m/STAGE/PORT``                            every message, once (Envelope)
-``s/STAGE``                                 a step that was taken (Step)
-``l/STAGE``                                 log lines (LogLine)
-``x/STAGE``                                 the supervisor's word that a process is dead (Lost)
-``j/STAGE``                                 journal: steps that the recorder has; what they consumed is done with
-``d/STAGE/REPLICA/PORT``                    which of the parts on ``m`` this replica is to work on (Deal)
-``again/STAGE/REPLICA/PORT``                from the recorder: a message that this process may have missed
-``knows/STAGE/REPLICA/INCARNATION``         from a publisher: it sends to this new process from now on
-``ready/STAGE/REPLICA/INCARNATION``         from the recorder: this new process has been sent again all that is older
-``e/STAGE/REPLICA/INCARNATION``             this process will publish no messages any more
-``settled/STAGE/REPLICA/INCARNATION``       the recorder has on the disk all that a dead process has sent
-``h/STAGE/REPLICA``                         a sign of life twice a second (Pulse)
-``present/STAGE/REPLICA/INCARNATION``       liveliness token, declared after the process' subscribers
-``q/NAME``                                  question to the supervisor (status, down, restart, call), answered in JSON
-==========================================  ==================================================================
-
-Links keep their order: who has a step has what it emitted.
+The keys are listed in docs/runner/keys.md. Links keep their order: who has a step has what it emitted.
 """
 
 from __future__ import annotations

@@ -11,20 +11,30 @@ END_SECONDS = 8.0
 
 
 class Presence:
-    """Which processes are there, for the ready barrier."""
+    """What is known of the processes of a run. May be told and asked from any thread."""
 
     def __init__(self):
         self.living: frozenset[Process] = frozenset()
+        self._newest: dict[tuple[str, int], int] = {}
+        self._ended: dict[tuple[str, int], int] = {}
+        """Incarnation by (stage, replica)."""
         self._changed = threading.Condition()
 
     def update(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went."""
         with self._changed:
             self.living = self.living | {process} if present else self.living - {process}
+            _raise(self._newest, process)
+            self._changed.notify_all()
+
+    def ended(self, process: Process) -> None:
+        """Takes note of one that publishes no more: it has ended, or is dead."""
+        with self._changed:
+            _raise(self._ended, process)
             self._changed.notify_all()
 
     def wait_for(self, expected: Iterable[tuple[str, int]], until: Callable[[], bool]) -> bool:
-        """Blocks until all are present; False when ``until`` became true first."""
+        """Blocks until all, (stage, replica), are present; False when ``until`` became true first."""
         wanted = set(expected)
         with self._changed:
             while not wanted <= {(process.stage, process.replica) for process in self.living}:
@@ -33,30 +43,7 @@ class Presence:
                 self._changed.wait(0.1)
         return True
 
-
-class Peers:
-    """Which processes of a run publish no more: they have ended, or are dead."""
-
-    def __init__(self) -> None:
-        self._newest: dict[tuple[str, int], int] = {}
-        self._ended: dict[tuple[str, int], int] = {}
-        """Incarnation by (stage, replica)."""
-        self._changed = threading.Condition()
-
-    def appeared(self, process: Process) -> None:
-        """Takes note of a process that is there."""
-        with self._changed:
-            place = process.stage, process.replica
-            self._newest[place] = max(process.incarnation, self._newest.get(place, 0))
-
-    def ended(self, process: Process) -> None:
-        """Takes note of one that has ended."""
-        with self._changed:
-            place = process.stage, process.replica
-            self._ended[place] = max(process.incarnation, self._ended.get(place, 0))
-            self._changed.notify_all()
-
-    def wait_for(self, stages: Collection[str], processes: Iterable[tuple[str, int]]) -> None:
+    def wait_for_the_end(self, stages: Collection[str], processes: Iterable[tuple[str, int]]) -> None:
         """Waits until nothing more comes from these stages, whose ``processes`` are (stage, replica)."""
         wanted = {place for place in (*processes, (SUPERVISOR, 0)) if place[0] in stages}
         with self._changed:
@@ -64,3 +51,8 @@ class Peers:
 
     def _has_ended(self, place: tuple[str, int]) -> bool:
         return self._ended.get(place, -1) >= self._newest.get(place, 0)
+
+
+def _raise(incarnations: dict[tuple[str, int], int], process: Process) -> None:
+    place = process.stage, process.replica
+    incarnations[place] = max(process.incarnation, incarnations.get(place, 0))
