@@ -135,8 +135,7 @@ class Recorder:
         self._writer.note_problem("the supervisor died")
 
     def _vitals(self) -> dict[str, Any]:
-        vitals = self._writer.vitals()
-        return {**vitals, "refused": vitals["refused"] + self._refusals.count}
+        return {**self._writer.vitals(), "refused": self._refusals.count}
 
     # ------------------------------------------------------------------------------------------ what is heard
 
@@ -188,7 +187,7 @@ class Recorder:
         if envelope is None:
             return
         if not self._manifest.steps_only:
-            self._writer.put(Envelope, packet.payload)
+            self._writer.put(envelope, packet.payload)
         for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
             self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
 
@@ -201,17 +200,19 @@ class Recorder:
             wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
         elif self._lost.get(step.process) != 0:
-            self._writer.put(Step, packet.payload)
+            self._writer.put(step, packet.payload)
             self._redelivery.note_step(step)
             self._said.put(step)
 
     def _on_log(self, _: str, packet: Packet) -> None:
-        self._writer.put(LogLine, packet.payload)
+        line = self._refusals.read(LogLine, packet)
+        if line is not None:
+            self._writer.put(line, packet.payload)
 
     def _on_lost(self, _: str, packet: Packet) -> None:
         lost = self._refusals.read(Lost, packet)
         if lost is not None:
-            self._writer.put(Lost, packet.payload)
+            self._writer.put(lost, packet.payload)
             with self._changing:
                 self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
 
@@ -266,9 +267,9 @@ class Recorder:
 
     def _complain(self, text: str) -> None:
         """Shows and records a line."""
-        line = pack(LogLine(RECORDER, 0, "error", text, time.time_ns()))
-        self._bus.publish(f"l/{RECORDER}", line)
-        self._writer.put(LogLine, line)
+        line = LogLine(RECORDER, 0, "error", text, time.time_ns())
+        self._bus.publish(f"l/{RECORDER}", pack(line))
+        self._writer.put(line, pack(line))
 
 
 def _steps_after(first: Step, waiting: deque[_Saying]) -> Iterator[Step]:

@@ -46,7 +46,6 @@ from runner.recording.recording import (
     RUN,
     STEPS_ONLY,
     VERDICT,
-    Kind,
     Verdict,
     payload_kind,
 )
@@ -125,7 +124,7 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _Payload:
-    kind: Kind
+    record: Recorded
     data: bytes | memoryview
     received_ns: int
 
@@ -136,12 +135,12 @@ class RecordingWriter:
     What the system has been handed is read back and proved from the file, see :mod:`runner.recording.proof`.
     """
 
-    def __init__(self, manifest: Manifest, refuse: Callable[[str], None]) -> None:
+    def __init__(self, manifest: Manifest, complain: Callable[[str], None]) -> None:
         """Creates the file with its metadata; raises Refused where that fails.
 
-        ``refuse`` is told, on the writer's thread, of each payload that is not recorded.
+        ``complain`` is told, on the writer's thread, where the recording ends before its time.
         """
-        self._refuse = refuse
+        self._complain = complain
         self._steps_only = manifest.steps_only
         self._topics = manifest.topics
         self._path = Path(manifest.path)
@@ -169,7 +168,6 @@ class RecordingWriter:
         self._overflowed = 0
         """Payloads for which there was no room."""
         self._recorded = 0
-        self._malformed = 0
         self._closing = threading.Event()
         self._closed = False
         """Whether the file takes no more."""
@@ -178,9 +176,9 @@ class RecordingWriter:
         self._thread = threading.Thread(target=self._write_all, name="recording", daemon=True)
         self._thread.start()
 
-    def put(self, kind: Kind, data: bytes | memoryview) -> None:
-        """Takes one payload as it came over the bus."""
-        payload = _Payload(kind, data, time.time_ns())
+    def put(self, record: Recorded, data: bytes | memoryview) -> None:
+        """Takes one record and its bytes as they came over the bus."""
+        payload = _Payload(record, data, time.time_ns())
         with self._counting:
             if self._closed or self._waiting_bytes > BACKLOG_BYTES:
                 self._overflowed += not self._closed
@@ -190,11 +188,10 @@ class RecordingWriter:
             self._waiting.append(payload)
 
     def vitals(self) -> dict[str, Any]:
-        """What the recorder's pulse says: records that are written, were refused and wait for the disk."""
+        """What the recorder's pulse says: records that are written and wait for the disk."""
         return {
             "state": "working" if self._waiting else "waiting",
             "steps": self._recorded,
-            "refused": self._malformed,
             "queued": {"disk": len(self._waiting)},
         }
 
@@ -251,31 +248,19 @@ class RecordingWriter:
 
     def _write(self, payload: _Payload) -> None:
         """Writes the first that waits. What fails on the way is among what waits or what is not proved yet."""
-        record = self._admit(payload)
-        if record is not None:
-            self._log_time_ns = max(payload.received_ns, self._log_time_ns + 1)
-            self._unproved[self._log_time_ns] = _named(record)
+        topic, named = _named(payload.record)
+        self._log_time_ns = max(payload.received_ns, self._log_time_ns + 1)
+        self._unproved[self._log_time_ns] = topic, named
         self._waiting.popleft()
         with self._counting:
             self._waiting_bytes -= len(payload.data)
-        if record is not None:
-            self._add(record, payload.data)
+        self._add(topic, payload.record, cast("bytes", payload.data))  # which need not be in one
 
-    def _admit(self, payload: _Payload) -> Recorded | None:
-        try:
-            return unpack(payload.kind, payload.data)
-        except CodecError as error:
-            self._malformed += 1
-            self._refuse(f"a malformed {payload.kind.__name__} was not recorded: {error}")
-            return None
-
-    def _add(self, record: Recorded, data: bytes | memoryview) -> None:
-        topic, _ = _named(record)
+    def _add(self, topic: str, record: Recorded, data: bytes) -> None:
         kind = record.type if isinstance(record, Envelope) else type(record).__name__
         channel = self._channels.get(topic) or self._register(topic, kind)
         sequence = MessageId.of(record.id).sequence if isinstance(record, Envelope) else getattr(record, "number", 0)
-        whole = cast("bytes", data)  # which need not be in one
-        self._writer.add_message(channel, self._log_time_ns, whole, record.time_ns, sequence % 2**32)
+        self._writer.add_message(channel, self._log_time_ns, data, record.time_ns, sequence % 2**32)
         self._chunk_bytes += len(data)
         self._recorded += 1
 
@@ -337,7 +322,7 @@ class RecordingWriter:
         reason = strerror or f"{type(error).__name__}: {error}".removesuffix(": ")
         self._problems.append(f"writing failed: {reason}")
         self._drop_unproved()
-        self._refuse(f"recording ends here: {reason}")
+        self._complain(f"recording ends here: {reason}")
 
     def _drop_unproved(self) -> None:
         with self._proving:
@@ -357,10 +342,9 @@ class RecordingWriter:
 
     def _drop(self, payload: _Payload) -> None:
         """Counts a payload that is not recorded, and names what it is or speaks of."""
-        with contextlib.suppress(CodecError):
-            topic, record = _named(unpack(payload.kind, payload.data))
-            with self._proving:
-                self._proof.drop(topic, record)
+        topic, record = _named(payload.record)
+        with self._proving:
+            self._proof.drop(topic, record)
 
 
 class _ChunkIndex:

@@ -40,13 +40,18 @@ def record_toys(
     return record(graph, folder / "toys.mcap", [*kept, *more], settings)
 
 
+def put(writer: RecordingWriter, record: Recorded) -> None:
+    """Hands a record to its writer with its bytes, as the recorder does."""
+    writer.put(record, pack(record))
+
+
 def record(
     graph: Graph, path: Path, records: Iterable[Recorded], settings: tuple[str, ...] = ()
 ) -> tuple[Path, Verdict]:
     """A recording of these records."""
     writer = RecordingWriter(manifest(graph, path, settings), print)
     for one in records:
-        writer.put(type(one), pack(one))
+        put(writer, one)
     return path, writer.close()
 
 

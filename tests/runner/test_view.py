@@ -12,12 +12,12 @@ from PIL import Image
 
 from runner.contract import Refused
 from runner.graph.graph import load_graph
-from runner.message.codec import Envelope, envelope, pack
+from runner.message.codec import Envelope, envelope
 from runner.recording.recording import Recording
 from runner.recording.writer import RecordingWriter
 from runner.view.rerun_view import follow, newest_live, save_rrd, screenshot, view_recording
 from runner.view.views import load_views
-from tests.runner.recordings import TOYS, manifest, record_toys
+from tests.runner.recordings import TOYS, manifest, put, record_toys
 from tests.runner.toys import Number
 
 VIEW = "view=tests.runner.toy_views:ToyViews"
@@ -74,7 +74,7 @@ def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
     viewer.start()
     for value in range(5):
         own = f"counter.number#{value}"
-        recorder.put(Envelope, pack(envelope(Number(value=value), id=own, lineage=own, time_ns=value, causes=())))
+        put(recorder, envelope(Number(value=value), id=own, lineage=own, time_ns=value, causes=()))
         time.sleep(0.1)
     recorder.close()
     viewer.join(20)
