@@ -1,7 +1,6 @@
 """What goes over the wire and into recordings: msgpack maps, arrays with a checked type and shape, never pickle."""
 
 import math
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
@@ -320,10 +319,6 @@ def _within(place: str, error: ValueError) -> ValueError:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
-_BIN_32 = b"\xc6"
-"""Byte that begins binary data of more than 64 KiB in msgpack; its length follows in four."""
-_CUT = os.urandom(16)
-"""Stands where an array of a message goes; no message can hold it by itself."""
 
 
 @cache
@@ -338,32 +333,19 @@ def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
 
 def encode(message: Message) -> bytes:
     """The message's bytes; raises CodecError where a field is not what its class declares, or it is too large."""
-    return b"".join(_encode_in_parts(message))
+    return bytes(_encode_after(b"", message))
 
 
-def _encode_in_parts(message: Message, before: int = 0) -> tuple[bytes | memoryview, ...]:
-    """What msgspec would write after so many bytes, cut where large arrays lie: they are parts of their own."""
-    arrays: list[memoryview] = []
-
-    def to_wire(value: Any) -> Any:
-        nonlocal before
-        wire = _to_wire(value)
-        if isinstance(wire, list) and value.nbytes > IN_PLACE_BYTES:
-            before += value.nbytes - len(_CUT)
-            arrays.append(memoryview(wire[2]).cast("B"))
-            wire[2] = msgspec.Raw(_BIN_32 + value.nbytes.to_bytes(4, "big") + _CUT)
-        return cast("Any", wire)
-
+def _encode_after(head: bytes, message: Message) -> bytearray:
+    """What the message's bytes follow, and these: in one piece, in which large arrays are copied once."""
+    payload = bytearray(head)
     try:
         _check_fields(message)
-        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
-        _check_size(before + len(body))
+        _encoder().encode_into(message, payload, len(head))
+        _check_size(len(payload))
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         raise _codec_error(type(message).__name__, error) from None
-    if not arrays:
-        return (body,)
-    first, *others = body.split(_CUT)
-    return (first, *(part for pair in zip(arrays, others, strict=True) for part in pair))
+    return payload
 
 
 def _check_fields(message: Message) -> None:
@@ -433,21 +415,11 @@ def unpack(kind: type[R], payload: bytes | memoryview) -> R:
 
 
 class Draft(msgspec.Struct, frozen=True):
-    """An envelope whose body is still in parts: large arrays are not copied, and must not change."""
+    """A message that is ready for its journey."""
 
-    cover: Envelope
-    """All but the body."""
-    head: bytes
-    """The cover's bytes."""
-    body: tuple[bytes | memoryview, ...]
-
-    def sealed(self) -> Envelope:
-        """The envelope, with a body of its own."""
-        return msgspec.structs.replace(self.cover, body=msgspec.Raw(b"".join(self.body)))
-
-    def parts(self) -> tuple[bytes | memoryview, ...]:
-        """What :func:`pack` makes of the envelope: a map whose last value is the body."""
-        return self.head, *self.body
+    envelope: Envelope
+    payload: bytearray
+    """What :func:`pack` makes of the envelope, whose body lies in here."""
 
 
 def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
@@ -455,12 +427,14 @@ def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tupl
     kind = type(message)
     cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
     head = pack(cover)
-    return Draft(cover, head, _encode_in_parts(message, len(head)))
+    payload = _encode_after(head, message)
+    body = msgspec.Raw(memoryview(payload)[len(head) :].toreadonly())
+    return Draft(msgspec.structs.replace(cover, body=body), payload)
 
 
 def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
-    """Wraps a message as :func:`draft` does, in one piece."""
-    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).sealed()
+    """Wraps a message as :func:`draft` does; the envelope alone."""
+    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).envelope
 
 
 def open_envelope(kind: type[M], sealed: Envelope) -> M:
