@@ -243,11 +243,11 @@ def _refuse_open(document: Document, layout: Layout) -> None:
             )
 
 
-def read_listen(document: Document, layout: Layout) -> str | None:
-    """Where others may listen to a graph; raises Refused where that is no address, or not safe without keys."""
+def check_listen(document: Document, layout: Layout) -> None:
+    """Raises Refused where the address at which others may listen to a graph is none, or not safe without keys."""
     value, place = document.values.get("listen"), document.place("listen")
     if value is None:
-        return None
+        return
     protocol, _, address = str(value).partition("/")
     if protocol not in ("tcp", "tls"):
         raise Refused(f"{place}: {value!r}: valid: tcp/127.0.0.1:7447, or with keys tls/ADDRESS:PORT")
@@ -263,7 +263,6 @@ def read_listen(document: Document, layout: Layout) -> str | None:
             f"{place}: {address} is not loopback, and without keys anybody who reaches it could listen; "
             f"valid: tcp/127.0.0.1:{host.port}, or hosts and keys (runner keys init)"
         )
-    return str(value)
 
 
 def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:
