@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol, cast
+from typing import IO, cast
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
@@ -41,36 +41,18 @@ class Entry:
     """One recorded payload and its topic."""
 
     topic: str
-    schema: str
-    """Name of the type."""
-    log_time_ns: int
-    """When the recorder received it, nanoseconds since the epoch."""
-    publish_time_ns: int
-    """Logical time."""
-    sequence: int
-    channel: int
-    """Number of its channel, see :attr:`Container.channels`."""
-    data: bytes
+    message: McapMessage
+    """Its payload ``data``, its ``log_time`` (when the recorder received it, nanoseconds since the epoch),
+    ``publish_time`` (logical) and ``channel_id``, see :attr:`Container.channels`."""
     offset: int
     """Of the chunk or record that holds it, for :meth:`Container.entries_at`."""
-
-
-class Source(Protocol):
-    """What a container is read from: a file, or a :class:`Growing` one."""
-
-    def read(self, size: int, /) -> bytes:
-        """The next ``size`` bytes, fewer only at the end."""
-        ...
-
-    def tell(self) -> int:
-        """Position of the next byte."""
-        ...
 
 
 class Container:
     """The payloads and metadata of one MCAP stream."""
 
-    def __init__(self, stream: Source, name: str) -> None:
+    def __init__(self, stream: IO[bytes] | Growing, name: str, known: Container | None = None) -> None:
+        """``known`` has read the same file, and knows topics that are named nowhere but at its end."""
         self.damage: list[Damage] = []
         self.torn = True
         """True until the end is found where the writer put it."""
@@ -78,8 +60,8 @@ class Container:
         """Payloads whose topic stood in a part of the file that is damaged."""
         self._stream = stream
         self._name = name
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = known.channels if known else {}
+        self.schemas: dict[int, Schema] = known.schemas if known else {}
 
     def __iter__(self) -> Iterator[Entry | Metadata]:
         """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all."""
@@ -96,13 +78,6 @@ class Container:
                 self.damage.append(Damage(offset, _reason(error)))
                 return
             yield from self._entries(record, offset)
-
-    def read_again(self, file: IO[bytes]) -> Iterator[Entry | Metadata]:
-        """Everything once more, now that the topics are known from the file's end too."""
-        file.seek(0)
-        self.damage.clear()
-        self._stream, self.torn, self.unknown = file, True, 0
-        return iter(self)
 
     def entries_at(self, file: IO[bytes], offset: int, end: int | None = None) -> Iterator[Entry]:
         """The entries between two places where records begin, by default those of one chunk; of the same file."""
@@ -133,18 +108,11 @@ class Container:
                 case McapMessage(channel_id=id) if id not in self.channels:
                     self.unknown += 1
                 case McapMessage():
-                    yield self._entry(inner, offset)
+                    yield Entry(self.channels[inner.channel_id].topic, inner, offset)
                 case Metadata():
                     yield inner
                 case _:
                     pass
-
-    def _entry(self, message: McapMessage, offset: int) -> Entry:
-        channel = self.channels[message.channel_id]
-        schema = self.schemas.get(channel.schema_id)
-        times = message.log_time, message.publish_time
-        name = schema.name if schema else ""
-        return Entry(channel.topic, name, *times, message.sequence, channel.id, message.data, offset)
 
     def _opened(self, chunk: Chunk, offset: int) -> Iterable[McapRecord]:
         try:
@@ -166,7 +134,7 @@ class Container:
             self.damage.append(damage)
 
 
-def _records(stream: Source, *, skip_magic: bool = False) -> Iterator[McapRecord]:
+def _records(stream: IO[bytes] | Growing, *, skip_magic: bool = False) -> Iterator[McapRecord]:
     source = cast("IO[bytes]", stream)
     return StreamReader(source, skip_magic=skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD).records
 

@@ -307,7 +307,8 @@ class RecordingWriter:
         with self._path.open("rb") as file:
             for entry in self._container.entries_at(file, self._proved, end):
                 with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
-                    yield entry.topic, entry.log_time_ns, _named(unpack(payload_kind(entry.topic), entry.data))[1]
+                    record = unpack(payload_kind(entry.topic), entry.message.data)
+                    yield entry.topic, entry.message.log_time, _named(record)[1]
 
     def _write_verdict(self) -> None:
         self._flush()
