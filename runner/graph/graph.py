@@ -164,7 +164,7 @@ class Node:
 
     def keeps(self, port: str) -> bool:
         """True where a message of this port is used for several parts."""
-        return self.type.handler_of(port).keeps(self.type.inputs[port])
+        return self.type.takers[port].keeps(self.type.inputs[port])
 
     def kept(self, port: str) -> int:
         """How many messages of a port parts that are under way may still need."""
@@ -584,7 +584,7 @@ def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
 
 def _needs_all(node: Node, port: InputPort) -> str:
     """Why a stage would wait for ever for what is left out on a port; empty where each message is taken by itself."""
-    handler = node.type.handler_of(port.name)
+    handler = node.type.takers[port.name]
     others = ", ".join(other.name for other in handler.inputs if other != port)
     if port.kind == "gather":
         return f"{port.name} gathers every part of a lineage"

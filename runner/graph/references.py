@@ -18,7 +18,7 @@ def load_class(reference: str, place: str) -> Any:
     module_name, _, class_name = reference.partition(":")
     members = vars(_module(module_name, place))
     if class_name not in members:
-        classes = [name for name, value in members.items() if _is_class_of(value, module_name)]
+        classes = [name for name, one in members.items() if isinstance(one, type) and one.__module__ == module_name]
         raise Refused(f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, classes)}")
     return members[class_name]
 
@@ -96,7 +96,3 @@ def _modules_beside(module_name: str) -> list[str]:
     except (ImportError, AttributeError):
         return []
     return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
-
-
-def _is_class_of(value: Any, module_name: str) -> bool:
-    return isinstance(value, type) and value.__module__ == module_name

@@ -228,11 +228,8 @@ def _check_array(array: np.ndarray, spec: Spec) -> None:
 def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
     if len(shape) != len(pattern):
         return False
-    named: dict[str, int] = {}
-    for extent, want in zip(shape, pattern, strict=True):
-        if extent != (named.setdefault(want, extent) if isinstance(want, str) else want):
-            return False
-    return True
+    named = dict(zip(pattern, shape, strict=True))
+    return shape == tuple(named[want] if isinstance(want, str) else want for want in pattern)
 
 
 def _shape(extents: Iterable[int | str]) -> str:
@@ -319,11 +316,7 @@ def _within(place: str, error: ValueError) -> ValueError:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
-
-
-@cache
-def _encoder() -> msgspec.msgpack.Encoder:
-    return msgspec.msgpack.Encoder(enc_hook=_to_wire)
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_to_wire)
 
 
 @cache
@@ -341,7 +334,7 @@ def _encode_after(head: bytes, message: Message) -> bytearray:
     payload = bytearray(head)
     try:
         _check_fields(message)
-        _encoder().encode_into(message, payload, len(head))
+        _ENCODER.encode_into(message, payload, len(head))
         _check_size(len(payload))
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         raise _codec_error(type(message).__name__, error) from None
@@ -358,7 +351,7 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     """Reads one message of a known class; raises CodecError and nothing else, whatever the bytes."""
     message = _decode_in_place(kind, body) if memoryview(body).nbytes > IN_PLACE_BYTES else None
     if message is None:
-        message = _decode(kind, body)
+        message = unpack(kind, body)
     try:
         _check_struct(message)
     except (ValueError, TypeError) as error:
@@ -401,7 +394,7 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
 
 def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many."""
-    payload = _encoder().encode(record)
+    payload = _ENCODER.encode(record)
     try:
         _check_size(len(payload))
     except ValueError as error:
@@ -409,9 +402,13 @@ def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> b
     return payload
 
 
-def unpack(kind: type[R], payload: bytes | memoryview) -> R:
+def unpack(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
     """Reads a record; raises CodecError and nothing else, whatever the bytes."""
-    return _decode(kind, payload)
+    try:
+        _check_size(memoryview(payload).nbytes)
+        return _decoder(kind).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
+        raise _codec_error(kind.__name__, error) from None
 
 
 class Draft(msgspec.Struct, frozen=True):
@@ -452,7 +449,7 @@ class Fields(dict[str, Any]):
 
 def decode_untyped(body: bytes | msgspec.Raw) -> Any:
     """Reads a message without knowing its class: maps as :class:`Fields`, arrays as arrays. Raises CodecError."""
-    return _named(_decode(cast("type[msgspec.Struct]", Any), body))
+    return _named(unpack(cast("type[msgspec.Struct]", Any), body))
 
 
 def _named(value: Any) -> Any:
@@ -468,14 +465,6 @@ def _named(value: Any) -> Any:
             return [_named(inner) for inner in cast("list[Any]", value)]
         case _:
             return value
-
-
-def _decode(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
-    try:
-        _check_size(memoryview(payload).nbytes)
-        return _decoder(kind).decode(payload)
-    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
-        raise _codec_error(kind.__name__, error) from None
 
 
 def _codec_error(type_name: str, error: Exception) -> CodecError:

@@ -1,7 +1,6 @@
 """Where and with what a graph ran: package versions, source revision, machine, and the files its settings name."""
 
 import hashlib
-import importlib.util
 import itertools
 import os
 import platform
@@ -16,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 import yaml
 
-from runner.graph.packaged import locate, portable_name
+from runner.graph.packaged import find, locate, portable_name
 from runner.graph.references import modules_of
 
 DISTRIBUTION = "scene-programming"
@@ -78,10 +77,7 @@ def revision(graph: Mapping[str, Any]) -> str:
 
 def _folder_of(package: str) -> Path | None:
     """Where a package or module at the top lies, without importing it."""
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return None
+    spec = find(package)
     places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
     return next((Path(place).parent for place in places if place and Path(place).exists()), None)
 
