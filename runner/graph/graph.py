@@ -25,6 +25,8 @@ T = TypeVar("T")
 K = TypeVar("K")
 MISSING = "???"
 """Stands in a graph file where the user must give a value with ``--set``."""
+REFERENCE = re.compile(r"\$\{([^}]*)\}")
+"""Stands there for the value of another setting: ``${stage.key}``."""
 SUPERVISOR = "supervisor"
 RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway", "journal", "log", "lost")
 """Names that no stage may have: other processes, and topics of recordings."""
@@ -183,7 +185,7 @@ class Node:
 
 
 class Route(msgspec.Struct, frozen=True):
-    """One edge as its publisher needs to know it."""
+    """One edge as its publisher and the recorder know it."""
 
     output: str
     """Port of the publisher."""
@@ -197,18 +199,13 @@ class Route(msgspec.Struct, frozen=True):
     kept: int
     """Messages that the consumer may use for further steps, and needs again when it restarts: as many as lineages may
     be under way on any of its ports; 0 where it uses each once."""
-
-
-class Destination(msgspec.Struct, frozen=True):
-    """One edge as the recorder knows it."""
-
-    route: Route
-    replicas: int
+    replicas: int = 1
+    """Of the consumer."""
 
     @property
     def takers(self) -> Iterable[int]:
         """Who has to do with a message: each replica, or (-1) any of them."""
-        return (-1,) if self.route.shared else range(self.replicas)
+        return (-1,) if self.shared else range(self.replicas)
 
 
 class Graph(GraphKeys, frozen=True, kw_only=True):
@@ -238,19 +235,21 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
     def routes(self, stage: str) -> list[Route]:
         """Every edge that leaves a stage."""
         return [
-            Route(edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port))
+            Route(
+                edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port), node.replicas
+            )
             for node in self.nodes.values()
             for port, edge in node.inputs.items()
             if edge.stage == stage
         ]
 
-    def destinations(self) -> dict[str, tuple[Destination, ...]]:
+    def destinations(self) -> dict[str, tuple[Route, ...]]:
         """Where the messages of every output port go, by ``STAGE/PORT``."""
-        found: dict[str, tuple[Destination, ...]] = {}
+        found: dict[str, tuple[Route, ...]] = {}
         for stage in (*self.nodes, SUPERVISOR):
             for route in self.routes(stage):
                 topic = f"{stage}/{route.output}"
-                found[topic] = (*found.get(topic, ()), Destination(route, self.nodes[route.consumer].replicas))
+                found[topic] = (*found.get(topic, ()), route)
         return found
 
     def outputs_of(self, stage: str) -> dict[str, type[Message]]:
@@ -370,7 +369,7 @@ def _collect(check: Callable[[K], T], items: Iterable[K]) -> dict[K, T]:
         except Refused as refusal:
             problems.append(str(refusal))
     if problems:
-        raise Refused("\n".join(problems))
+        raise Refused("\n".join(dict.fromkeys(problems)))
     return results
 
 
@@ -457,8 +456,7 @@ def _resolve_settings(document: Document, entries: Mapping[str, StageEntry], typ
     """Makes paths absolute, fills ``${stage.key}`` in and refuses what is still missing."""
     _absolute_paths(document, entries, types)
     settings = [(name, key) for name, entry in entries.items() for key in entry.config]
-    _collect(lambda keys: _refuse_missing(document, entries, *keys), settings)
-    _collect(lambda keys: _interpolate(document, entries, *keys), settings)
+    _collect(lambda keys: _fill_in(document, entries, keys), settings)
     _absolute_paths(document, entries, types)
 
 
@@ -476,32 +474,26 @@ def _path_settings(config: type[Any] | None) -> set[str]:
     return {name for name, hint in hints.items() if hint is Path or Path in get_args(hint)}
 
 
-def _refuse_missing(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
-    if entries[name].config[key] == MISSING:
-        place = document.place("stages", name, "config", key)
-        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
-
-
-def _interpolate(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
+def _fill_in(document: Document, entries: Mapping[str, StageEntry], *keys: tuple[str, str]) -> Any:
+    """Puts what a setting refers to in its place, and the same there first; ``keys`` lead from one to the next."""
+    name, key = keys[-1]
     value = entries[name].config[key]
-    if not isinstance(value, str):
-        return
     place = document.place("stages", name, "config", key)
+    if value == MISSING:
+        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
+    valid = {f"{name}.{key}": (name, key) for name, entry in entries.items() for key in entry.config}
 
-    def replacement(match: re.Match[str]) -> str:
-        return str(_setting(entries, match.group(1), place))
+    def setting(match: re.Match[str]) -> Any:
+        target = valid.get(match[1])
+        if target is None or target in keys:
+            raise Refused(f"{place}: no setting {match[1]!r} to fill in{suggest(match[1], valid)}")
+        return _fill_in(document, entries, *keys, target)
 
-    whole = re.fullmatch(r"\$\{([^}]*)\}", value)
-    filled = _setting(entries, whole.group(1), place) if whole else re.sub(r"\$\{([^}]*)\}", replacement, value)
-    entries[name].config[key] = filled
-
-
-def _setting(entries: Mapping[str, StageEntry], reference: str, place: str) -> Any:
-    stage, _, key = reference.partition(".")
-    valid = [f"{name}.{key}" for name, entry in entries.items() for key in entry.config]
-    if reference not in valid:
-        raise Refused(f"{place}: no setting {reference!r} to fill in{suggest(reference, valid)}")
-    return entries[stage].config[key]
+    if isinstance(value, str):
+        whole = re.fullmatch(REFERENCE, value)
+        filled = setting(whole) if whole else re.sub(REFERENCE, lambda match: str(setting(match)), value)
+        entries[name].config[key] = value = filled
+    return value
 
 
 def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> Node:

@@ -130,17 +130,15 @@ def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of everything that a setting of the graph names: files, folders with all that is in them, and YAML files
     with the files they name, for example the catalogue with its meshes."""
     texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
-    files = {text: locate(Path(text), Path()) for text in sorted(texts)}
-    there = {text: file for text, file in files.items() if os.path.exists(file)}  # noqa: PTH110 - takes any text
-    hashes = {text: _hash(_parts(file)) for text, file in there.items()}
-    return {text: found for text, found in hashes.items() if found}
+    parts = {text: _parts(locate(Path(text), Path())) for text in sorted(texts)}
+    return {text: _hash(files) for text, files in parts.items() if files}
 
 
 def _parts(path: Path) -> list[Path]:
     """The files that belong to a setting's file or folder; none where it is neither."""
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112 - takes any text, and Path.is_dir() does not
         return sorted(inner for inner in itertools.islice(path.rglob("*"), HASHED_FILES) if inner.is_file())
-    if not path.is_file():
+    if not os.path.isfile(path):  # noqa: PTH113
         return []
     named = {path.parent / text for text in _texts(_yaml(path))} if path.suffix in (".yaml", ".yml") else set[Path]()
     return [path, *sorted(inner for inner in named if inner.is_file())]
@@ -168,10 +166,10 @@ def _hash(paths: Sequence[Path]) -> str:
     size = sum(path.stat().st_size for path in paths)
     if size > HASHED_BYTES:
         return f"not hashed, {size} bytes"
-    hashes = [hashlib.sha256(path.read_bytes()) for path in paths]
-    if len(hashes) < 2:
-        return "".join(found.hexdigest() for found in hashes)
-    return hashlib.sha256(b"".join(found.digest() for found in hashes)).hexdigest()
+    first, *others = (hashlib.sha256(path.read_bytes()) for path in paths)
+    if not others:
+        return first.hexdigest()
+    return hashlib.sha256(b"".join(found.digest() for found in (first, *others))).hexdigest()
 
 
 def portable(value: Any, root: Path) -> Any:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -129,7 +129,7 @@ class Recording:
         """Processes that died."""
         self.repeated: Counter[str] = Counter()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
-        self._open: OrderedDict[int, dict[str, Envelope]] = OrderedDict()
+        self._open = lru_cache(OPEN_CHUNKS)(self._envelopes_at)
         self._order: list[tuple[str, int, Record]] = []
         """Topic, log time and record of all entries in the order of the file."""
         self._misplaced: dict[str, None] = {}
@@ -199,13 +199,7 @@ class Recording:
 
     def recorded(self, id: str) -> Envelope:
         """One message by id, as it was when it was recorded; raises KeyError where it is not."""
-        offset = self.messages[id].offset
-        if offset not in self._open:
-            self._open[offset] = self._envelopes_at(offset)
-        self._open.move_to_end(offset)
-        if len(self._open) > OPEN_CHUNKS:
-            self._open.popitem(last=False)
-        return self._open[offset][id]
+        return self._open(self.messages[id].offset)[id]
 
     def envelopes(self) -> Iterator[Envelope]:
         """Every message in the order of recording."""

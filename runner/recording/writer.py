@@ -21,7 +21,7 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Message, Refused
-from runner.graph.graph import Destination
+from runner.graph.graph import Route
 from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.message.ids import MessageId
@@ -67,7 +67,6 @@ Recorded = Envelope | Step | LogLine | Lost
 class Topic(msgspec.Struct, frozen=True):
     """What is recorded under one topic."""
 
-    type: str
     version: int
     schema: dict[str, Any]
 
@@ -91,13 +90,13 @@ class Manifest(msgspec.Struct, frozen=True):
     """None on one machine."""
     steps_only: bool = False
     """Record no messages."""
-    destinations: dict[str, tuple[Destination, ...]] = {}
+    destinations: dict[str, tuple[Route, ...]] = {}
     """Where messages go, by topic."""
 
 
 def topic(kind: type[Message]) -> Topic:
     """Describes the topic of a message type."""
-    return Topic(kind.__name__, kind.version, json_schema(kind))
+    return Topic(kind.version, json_schema(kind))
 
 
 def run_metadata(manifest: Manifest) -> dict[str, str]:
