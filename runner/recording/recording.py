@@ -18,6 +18,7 @@ from mcap.records import Metadata
 from runner.contract import Refused
 from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
+from runner.message.ids import IdText
 from runner.recording.container import Container, Damage, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
@@ -97,13 +98,12 @@ def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
 
 
-def _decoded(text: str, default: T) -> T:
-    """What a JSON text holds; the default where it is none or of another type."""
+def _decoded(text: str, kind: type[T]) -> T:
+    """What a JSON text holds; nothing (``kind()``) where it is none or of another type."""
     try:
-        value = json.loads(text)
-    except ValueError:
-        return default
-    return value if isinstance(value, type(default)) else default
+        return msgspec.convert(json.loads(text), kind)
+    except (ValueError, msgspec.ValidationError):
+        return kind()
 
 
 def _readable(entry: Entry) -> bool:
@@ -156,7 +156,7 @@ class Recording:
 
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
-        return _decoded(self.run.get(name, ""), default)
+        return _decoded(self.run.get(name, ""), type(default)) or default
 
     @property
     def damage(self) -> list[Damage]:
@@ -172,7 +172,7 @@ class Recording:
     def verdict(self) -> Verdict:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
-        counts = _decoded(written.get("counts", ""), dict[str, int]()) if VERDICT in self.metadata else None
+        counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason = self._breakage or written.get("reason", "")
         if self._steps_only:
             return Verdict(False, (), reason, counts)
@@ -283,7 +283,7 @@ class Recording:
         proof = Proof(self.graph)
         for entry in self._order:
             proof.enter(*entry)
-        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[str]()):
+        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof
 
