@@ -26,17 +26,6 @@ _BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowE
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
-    """A place in the file that does not hold what was written there."""
-
-    offset: int
-    reason: str
-
-    def __str__(self) -> str:
-        return f"byte {self.offset}: {self.reason}"
-
-
-@dataclass(frozen=True, slots=True)
 class Entry:
     """One recorded payload and its topic."""
 
@@ -53,7 +42,8 @@ class Container:
 
     def __init__(self, stream: IO[bytes] | Growing, name: str, known: Container | None = None) -> None:
         """``known`` has read the same file, and knows topics that are named nowhere but at its end."""
-        self.damage: list[Damage] = []
+        self.damage: list[str] = []
+        """Places that do not hold what was written there, as ``byte 4711: reason``."""
         self.torn = True
         """True until the end is found where the writer put it."""
         self.unknown = 0
@@ -74,8 +64,11 @@ class Container:
                 self.torn = False
                 return
             except _BROKEN as error:
-                self._refuse_foreign(offset, error)
-                self.damage.append(Damage(offset, _reason(error)))
+                if offset == 0 and self._stream.tell() <= 8:
+                    foreign = isinstance(error, InvalidMagic)
+                    what = "not an MCAP file" if foreign else "empty or cut off in its first bytes"
+                    raise Refused(f"{self._name}: {what}") from None
+                self._note(offset, _reason(error))
                 return
             yield from self._entries(record, offset)
 
@@ -92,11 +85,6 @@ class Container:
             if record is None:
                 return
             yield from (entry for entry in self._entries(record, at) if isinstance(entry, Entry))
-
-    def _refuse_foreign(self, offset: int, error: Exception) -> None:
-        if offset == 0 and self._stream.tell() <= 8:
-            what = "not an MCAP file" if isinstance(error, InvalidMagic) else "empty or cut off in its first bytes"
-            raise Refused(f"{self._name}: {what}") from None
 
     def _entries(self, record: McapRecord, offset: int) -> Iterator[Entry | Metadata]:
         for inner in self._opened(record, offset) if isinstance(record, Chunk) else (record,):
@@ -129,7 +117,7 @@ class Container:
             return ()
 
     def _note(self, offset: int, reason: str) -> None:
-        damage = Damage(offset, reason)
+        damage = f"byte {offset}: {reason}"
         if damage not in self.damage:
             self.damage.append(damage)
 

@@ -19,7 +19,7 @@ from runner.contract import Refused
 from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
 from runner.message.ids import IdText
-from runner.recording.container import Container, Damage, Entry, open_file
+from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
 from runner.recording.provenance import fingerprint, numerical
@@ -159,8 +159,8 @@ class Recording:
         return _decoded(self.run.get(name, ""), type(default)) or default
 
     @property
-    def damage(self) -> list[Damage]:
-        """Where the file does not hold what was written."""
+    def damage(self) -> list[str]:
+        """Places that do not hold what was written there, as ``byte 4711: reason``."""
         return self.container.damage
 
     @property
@@ -219,7 +219,7 @@ class Recording:
             try:
                 self._enter_entry(record)
             except CodecError as error:
-                self.damage.append(Damage(record.offset, f"a record of {record.topic}: {error}"))
+                self.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
 
     def _enter_metadata(self, record: Metadata) -> None:
         if record.name in self.metadata:

@@ -25,18 +25,9 @@ from runner.graph.graph import Route
 from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.message.ids import MessageId
+from runner.recording import provenance
 from runner.recording.container import Container, hold
 from runner.recording.proof import Proof, Record, in_short
-from runner.recording.provenance import (
-    file_hashes,
-    fingerprint,
-    machine,
-    numerical,
-    package_versions,
-    portable,
-    revision,
-    runner_version,
-)
 from runner.recording.recording import (
     FORMAT,
     JOURNAL,
@@ -101,8 +92,8 @@ def topic(kind: type[Message]) -> Topic:
 
 def run_metadata(manifest: Manifest) -> dict[str, str]:
     """What ran where, as the recording keeps it: one JSON text per aspect."""
-    graph = portable(json.loads(manifest.graph), Path.cwd())
-    here, packages = machine(), package_versions()
+    graph = provenance.portable(json.loads(manifest.graph), Path.cwd())
+    here, packages = provenance.machine(), provenance.package_versions()
     return {
         "format": FORMAT,
         "graph": json.dumps(graph),
@@ -111,12 +102,12 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
         "settings": json.dumps(manifest.settings),
         "records": STEPS_ONLY if manifest.steps_only else "messages and steps",
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "revision": revision(graph),
-        "runner": runner_version(),
+        "revision": provenance.revision(graph),
+        "runner": provenance.runner_version(),
         "packages": json.dumps(packages),
         "machine": json.dumps(here),
-        "fingerprint": fingerprint(here, packages, numerical(graph)),
-        "files": json.dumps(file_hashes(graph)),
+        "fingerprint": provenance.fingerprint(here, packages, provenance.numerical(graph)),
+        "files": json.dumps(provenance.file_hashes(graph)),
     }
 
 
