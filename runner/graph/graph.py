@@ -346,7 +346,7 @@ def _build(document: Document) -> Graph:
     raw = document.values.get("stages")
     if not isinstance(raw, dict) or not raw:
         raise Refused(f"{document.place('stages')}: expected a mapping of stage names to stages")
-    names = list(cast("dict[str, Any]", raw))
+    names = list[str](raw)
     entries = _collect(lambda name: _read_entry(document, name), names)
     types = _collect(lambda name: _load(document, name, entries[name]), names)
     _resolve_settings(document, entries, types)
@@ -377,7 +377,6 @@ def _read(kind: type[T], values: Any, document: Document, keys: Keys) -> T:
     """Converts a mapping of the file to a struct or dataclass, naming the key that does not fit."""
     if not isinstance(values, dict):
         raise Refused(f"{document.place(*keys)}: expected a mapping, got {values!r}")
-    values = cast("dict[str, Any]", values)
     known = {field.encode_name for field in msgspec.inspect.type_info(kind).fields}  # type: ignore[union-attr]
     for key in values:
         if key not in known:

@@ -17,7 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -194,7 +194,7 @@ def _entries(document: Document) -> Mapping[str, Any]:
         return {}
     if not isinstance(raw, dict) or not raw:
         raise Refused(f"{document.place('hosts')}: expected a mapping of names to addresses, got {raw!r}")
-    return cast("dict[str, Any]", raw)
+    return raw
 
 
 def _read_host(document: Document, name: str, value: object) -> Host:

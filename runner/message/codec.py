@@ -191,12 +191,12 @@ def _to_wire(value: Any) -> Any:
 def _from_wire(kind: type, value: Any) -> Any:
     """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
     if isinstance(value, np.ndarray):  # of a message that is checked before it travels
-        return cast("Any", value)
+        return value
     if getattr(kind, "__origin__", None) is not np.ndarray:
         raise ValueError(f"{kind} cannot be decoded")
     match value:
         case [str() as name, list() as shape, bytes() as data]:
-            return _array(name, cast("list[Any]", shape), data)
+            return _array(name, shape, data)
         case _:
             raise ValueError("expected an array as [dtype, shape, bytes]")
 
@@ -455,14 +455,14 @@ def decode_untyped(body: bytes | msgspec.Raw) -> Any:
 def _named(value: Any) -> Any:
     match value:
         case dict():
-            return Fields({str(key): _named(inner) for key, inner in cast("dict[Any, Any]", value).items()})
+            return Fields({str(key): _named(inner) for key, inner in value.items()})
         case [str() as name, list() as shape, bytes() as data] if name in DTYPES:
             try:
-                return _array(name, cast("list[Any]", shape), data)
+                return _array(name, shape, data)
             except ValueError as error:
                 raise CodecError("array", "", str(error)) from None
         case list():
-            return [_named(inner) for inner in cast("list[Any]", value)]
+            return [_named(inner) for inner in value]
         case _:
             return value
 

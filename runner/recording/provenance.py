@@ -155,10 +155,10 @@ def _texts(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict):
-        for inner in cast("dict[str, Any]", value).values():
+        for inner in value.values():
             yield from _texts(inner)
     elif isinstance(value, list):
-        for inner in cast("list[Any]", value):
+        for inner in value:
             yield from _texts(inner)
 
 
@@ -188,8 +188,8 @@ def with_texts(value: Any, change: Callable[[str], str]) -> Any:
         case str():
             return change(value)
         case dict():
-            return {key: with_texts(inner, change) for key, inner in cast("dict[str, Any]", value).items()}
+            return {key: with_texts(inner, change) for key, inner in value.items()}
         case list():
-            return [with_texts(inner, change) for inner in cast("list[Any]", value)]
+            return [with_texts(inner, change) for inner in value]
         case _:
             return value
