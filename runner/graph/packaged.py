@@ -1,7 +1,5 @@
 """Files that come with installed packages: ``stages/scene/catalogue.yaml`` is found from any folder."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from importlib.machinery import ModuleSpec

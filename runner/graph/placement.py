@@ -10,8 +10,6 @@ A graph file names them, the first is the head::
 router instead of linking to each other: the head's own, or another one by its address.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 Recordings keep their bytes. What a table holds: :class:`runner.contract.Migration`.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import ChainMap
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Proves from the records of a recording, one by one in the order of the file, that nothing is missing."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping

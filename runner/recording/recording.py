@@ -1,7 +1,5 @@
 """What a recording holds: messages by id, journalled steps, log lines, its origin, and whether it is complete."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """Writes what a torn or damaged recording still holds as a clean, indexed one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import IO
 
