@@ -30,8 +30,6 @@ REFERENCE = re.compile(r"\$\{([^}]*)\}")
 SUPERVISOR = "supervisor"
 RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway", "journal", "log", "lost")
 """Names that no stage may have: other processes, and topics of recordings."""
-READ_FROM_CLASSES = ("commands", "shares")
-"""Keys of a stage's entry that say what its class does, for those who read recordings without it."""
 FINISHED = port_name(Finished)
 RESTARTS = 3
 """Restarts of one process before the graph ends. None for devices: what they drive has moved on meanwhile."""
@@ -224,8 +222,7 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
 
     def hosts_of_stages(self) -> dict[str, set[str]]:
         """The machines on which each stage has processes."""
-        head = {self.layout.head.name}
-        return {node.name: set(node.placement) or head for node in self.nodes.values()}
+        return {node.name: set(node.placement) or {self.layout.head.name} for node in self.nodes.values()}
 
     def here(self) -> "Graph":
         """The same graph with every process on the machine that starts it."""
@@ -335,8 +332,9 @@ def graph_from_json(text: str, label: str = "graph") -> Graph:
 
 
 def _stated(entry: Any) -> Any:
-    """What a graph file states of a stage, without its host: what is read back runs where it is read."""
-    left_out = ("host", *READ_FROM_CLASSES)
+    """What a graph file states of a stage, without what its class says (``commands``, ``shares``) and without its
+    host: what is read back runs where it is read."""
+    left_out = ("host", "commands", "shares")
     return {key: value for key, value in entry.items() if key not in left_out} if isinstance(entry, dict) else entry
 
 
@@ -432,9 +430,6 @@ def _read_edge(document: Document, keys: Keys, value: Any) -> Edge:
     if edge.source.count(".") != 1:
         raise Refused(f"{document.place(*keys)}: {edge.source!r} is not of the form stage.port")
     return edge
-
-
-# ---------------------------------------------------------------------------------------------- classes
 
 
 def _load(document: Document, name: str, entry: StageEntry) -> StageType:

@@ -67,7 +67,6 @@ class Intervals:
         """Takes a number out where it is in."""
         at = bisect_right(self._starts, number) - 1
         if at >= 0 and number < self._stops[at]:
-            start, stop = self._starts[at], self._stops[at]
-            rest = [(first, last) for first, last in ((start, number), (number + 1, stop)) if first < last]
-            self._starts[at : at + 1] = [first for first, _ in rest]
-            self._stops[at : at + 1] = [last for _, last in rest]
+            rest = Intervals([(self._starts[at], number), (number + 1, self._stops[at])])
+            self._starts[at : at + 1] = rest._starts
+            self._stops[at : at + 1] = rest._stops

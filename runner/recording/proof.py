@@ -75,7 +75,7 @@ class Proof:
 
     def __init__(self, graph: Mapping[str, Any]) -> None:
         """``graph`` is the recorded one; raises msgspec.ValidationError where it is not what is recorded of graphs."""
-        self._stages = msgspec.convert(graph["stages"], dict[str, _Stage])
+        self._stages = msgspec.convert(graph.get("stages"), dict[str, _Stage])
         self._edges = dict(_edges(self._stages))
         names = ((name, replica) for name, stage in self._stages.items() for replica in range(stage.replicas))
         self._processes = {name: defaultdict[int, _Process](_Process) for name in ((SUPERVISOR, 0), *names)}

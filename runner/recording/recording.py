@@ -290,9 +290,6 @@ class Recording:
             damaged = f" ({self.damage[0]})" if self.damage else ""
             raise Refused(f"{self.path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
         graph = self.aspect("graph", dict[str, Any]())
-        stages = graph.get("stages")
-        if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
-            raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph")
         try:
             Proof(graph)
         except msgspec.ValidationError as error:

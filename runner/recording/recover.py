@@ -8,9 +8,9 @@ from mcap.writer import CompressionType, Writer
 from runner.contract import Refused
 from runner.recording.container import Container, Entry, is_being_written, open_file
 from runner.recording.recording import PROFILE, VERDICT, Recording
+from runner.recording.writer import CHUNK_BYTES
 
 SUFFIX = ".recovered.mcap"
-CHUNK_BYTES = 4 * 2**20
 
 
 def recover(path: Path, target: Path | None = None) -> tuple[Recording, Path]:
