@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from runner.contract import Level, Message, Refused, Stage
 from runner.graph.document import suggest
-from runner.graph.graph import QUEUE, Edge, Node
+from runner.graph.graph import Edge, Node
 from runner.graph.ports import StageType, inspect_stage, port_name
 from runner.message import codec
 from runner.message.codec import Envelope, open_envelope
@@ -77,7 +77,7 @@ def node_of(stage: Stage, name: str | None = None) -> Node:
     """A stage as a graph would have it, with its ports open."""
     cls = type(stage)
     kind = inspect_stage(cls)
-    edges = {port: Edge("given", port, "block", QUEUE) for port in kind.inputs}
+    edges = {port: Edge(f"given.{port}") for port in kind.inputs}
     return Node(name or port_name(cls), f"{cls.__module__}:{cls.__qualname__}", kind, None, edges, 1, 0)
 
 
@@ -114,7 +114,7 @@ class Bench:
         """Runs the source, where there is one, to its end; each message is a step."""
         if (source := self.node.type.source) is not None:
             for draft in self._executor.advance(source, time.time_ns):
-                yield Done(Ready(source, ()), [draft.sealed()])
+                yield Done(Ready(source, ()), [draft.envelope])
 
     def say_what_is_left(self) -> None:
         """Logs what was never worked on."""

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import yaml
 
@@ -59,7 +59,7 @@ class Document:
         stage, dot, setting = key.partition(".")
         if not dot:
             return (key,)
-        stages = cast("dict[str, Any]", self.values.get("stages") or {})
+        stages = self.values.get("stages") or {}
         if stage == "hosts" and stage not in stages:
             return ("hosts", setting)
         if stage not in stages:
@@ -116,5 +116,5 @@ def _nested(values: dict[str, Any], keys: Keys) -> dict[str, Any]:
     """The mapping at ``keys``, made where it is missing."""
     for key in keys:
         inner = values.get(key)
-        values[key] = values = cast("dict[str, Any]", inner) if isinstance(inner, dict) else {}
+        values[key] = values = inner if isinstance(inner, dict) else {}
     return values

@@ -7,7 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -17,7 +17,7 @@ from msgspec import Meta
 from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.packaged import locate
-from runner.graph.placement import ALONE, Layout, read_layout, read_listen, read_placement
+from runner.graph.placement import ALONE, Layout, check_listen, read_layout, read_placement
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
@@ -25,24 +25,21 @@ T = TypeVar("T")
 K = TypeVar("K")
 MISSING = "???"
 """Stands in a graph file where the user must give a value with ``--set``."""
+REFERENCE = re.compile(r"\$\{([^}]*)\}")
+"""Stands there for the value of another setting: ``${stage.key}``."""
 SUPERVISOR = "supervisor"
 RESERVED = (SUPERVISOR, "recorder", "viewer", "gateway", "journal", "log", "lost")
 """Names that no stage may have: other processes, and topics of recordings."""
-READ_FROM_CLASSES = ("commands", "shares")
-"""Keys of a stage's entry that say what its class does, for those who read recordings without it."""
-SUPERVISOR_OUTPUTS: dict[str, type[Message]] = {port_name(Restarted): Restarted}
 FINISHED = port_name(Finished)
 RESTARTS = 3
 """Restarts of one process before the graph ends. None for devices: what they drive has moved on meanwhile."""
 QUEUE = 64
-GRAPH_KEYS = ("name", "seed", "view", "listen", "score", "tolerances", "migrations", "numerical")
-"""Of a graph, beside its stages and hosts."""
 NUMERICAL = ("numpy",)
 """The packages that compute where a graph names none."""
 
 
-class EdgeEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An edge whose policy is stated."""
+class Edge(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where an input port gets its messages from, and what happens when they come too fast."""
 
     source: Annotated[str, Meta(description="stage.port")] = msgspec.field(name="from")
     policy: Annotated[
@@ -51,13 +48,48 @@ class EdgeEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "block"
     queue: Annotated[int, Meta(ge=1, description="Unacknowledged lineages after which the publisher waits")] = QUEUE
 
+    @property
+    def stage(self) -> str:
+        """The publisher."""
+        return self.source.partition(".")[0]
 
-class StageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    @property
+    def port(self) -> str:
+        """Its output port."""
+        return self.source.partition(".")[2]
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a process may do before it is taken for hung, or for out of bounds."""
+
+    heartbeat: Annotated[
+        float, Meta(gt=0, description="Seconds without a sign of life after which a process counts as hung")
+    ] = 30.0
+    """Long: code that keeps the interpreter to itself is slow, not dead."""
+    timeout: Annotated[
+        float, Meta(gt=0, description="Seconds a handler may compute; time held back by consumers does not count")
+    ] = 300.0
+    """A device's source may wait for the world as long as it likes."""
+    startup: Annotated[float, Meta(gt=0, description="Seconds until a process must be ready")] = 180.0
+    memory: Annotated[
+        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$")] | None,
+        Meta(description="What a process may hold, for example 2GB"),
+    ] = None
+
+    @property
+    def memory_bytes(self) -> float:
+        """The limit of memory as a number; infinite where none is set."""
+        if self.memory is None:
+            return math.inf
+        return float(self.memory[:-2]) * 1000 ** " kMGT".index(self.memory[-2])
+
+
+class StageEntry(Limits, frozen=True, kw_only=True):
     """One stage of the graph."""
 
     stage: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$", description="module:Class")]
     config: Annotated[dict[str, Any], Meta(description="Settings of the stage, as its Config declares them")] = {}
-    inputs: Annotated[dict[str, str | EdgeEntry], Meta(description="Input port -> stage.port")] = {}
+    inputs: Annotated[dict[str, str | Edge], Meta(description="Input port -> stage.port")] = {}
     replicas: Annotated[
         Annotated[int, Meta(ge=1)] | Literal["auto"],
         Meta(description="Processes that share the parts; auto: one a core"),
@@ -69,35 +101,16 @@ class StageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str | dict[str, Annotated[int, Meta(ge=1)]] | None,
         Meta(description="Where it runs, or how many replicas run on which host; without it on the first host"),
     ] = None
-    heartbeat: Annotated[
-        float, Meta(gt=0, description="Seconds without a sign of life after which a process counts as hung")
-    ] = 30.0
-    timeout: Annotated[
-        float, Meta(gt=0, description="Seconds a handler may compute; time held back by consumers does not count")
-    ] = 300.0
-    startup: Annotated[float, Meta(gt=0, description="Seconds until a process must be ready")] = 180.0
-    memory: Annotated[
-        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$")] | None,
-        Meta(description="What a process may hold, for example 2GB"),
-    ] = None
 
 
-class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A graph of stages: what runs, with which settings, and what flows where."""
+class GraphKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is said of a graph beside its stages and hosts."""
 
     name: Annotated[str, Meta(pattern=r"^[\w-]+$", description="Names the recordings")]
-    stages: dict[str, StageEntry]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
     view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
     listen: Annotated[
         str | None, Meta(description="Where others may listen, for example tcp/127.0.0.1:7447; only this user without")
-    ] = None
-    hosts: Annotated[
-        dict[str, str] | None, Meta(description="Machine -> ADDRESS[:PORT]; the first is the head and needs a port")
-    ] = None
-    keys: Annotated[str | None, Meta(description="Folder that `runner keys init` made; turns TLS on")] = None
-    router: Annotated[
-        str | None, Meta(description="Where all processes meet: the head's name, or ADDRESS:PORT of another router")
     ] = None
     score: Annotated[str | None, Meta(description="module:Class that says in numbers how well a run went")] = None
     tolerances: Annotated[
@@ -111,34 +124,17 @@ class GraphEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = NUMERICAL
 
 
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """Where an input port gets its messages from, and what happens when they come too fast."""
+class GraphEntry(GraphKeys, frozen=True, kw_only=True):
+    """A graph of stages: what runs, with which settings, and what flows where."""
 
-    stage: str
-    port: str
-    policy: Literal["block", "latest"]
-    queue: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """What a process may do before it is taken for hung, in seconds, or for out of bounds."""
-
-    heartbeat: float = 30.0
-    """Without a pulse. Long: code that keeps the interpreter to itself is slow, not dead."""
-    timeout: float = 300.0
-    """Inside one handler. A device's source may wait for the world as long as it likes."""
-    startup: float = 180.0
-    memory: str | None = None
-    """Resident, for example ``2GB``."""
-
-    @property
-    def memory_bytes(self) -> float:
-        """The same as a number; infinite where none is set."""
-        if self.memory is None:
-            return math.inf
-        return float(self.memory[:-2]) * 1000 ** " kMGT".index(self.memory[-2])
+    stages: dict[str, StageEntry]
+    hosts: Annotated[
+        dict[str, str] | None, Meta(description="Machine -> ADDRESS[:PORT]; the first is the head and needs a port")
+    ] = None
+    keys: Annotated[str | None, Meta(description="Folder that `runner keys init` made; turns TLS on")] = None
+    router: Annotated[
+        str | None, Meta(description="Where all processes meet: the head's name, or ADDRESS:PORT of another router")
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +149,7 @@ class Node:
     inputs: dict[str, Edge]
     replicas: int
     restarts: int
-    limits: Limits = Limits()
+    limits: Limits = field(default_factory=Limits)
     placement: tuple[str, ...] = ()
     """The host of each replica; empty where all are on the head."""
 
@@ -168,7 +164,7 @@ class Node:
 
     def keeps(self, port: str) -> bool:
         """True where a message of this port is used for several parts."""
-        return self.type.handler_of(port).keeps(self.type.inputs[port])
+        return self.type.takers[port].keeps(self.type.inputs[port])
 
     def kept(self, port: str) -> int:
         """How many messages of a port parts that are under way may still need."""
@@ -187,7 +183,7 @@ class Node:
 
 
 class Route(msgspec.Struct, frozen=True):
-    """One edge as its publisher needs to know it."""
+    """One edge as its publisher and the recorder know it."""
 
     output: str
     """Port of the publisher."""
@@ -201,36 +197,21 @@ class Route(msgspec.Struct, frozen=True):
     kept: int
     """Messages that the consumer may use for further steps, and needs again when it restarts: as many as lineages may
     be under way on any of its ports; 0 where it uses each once."""
-
-
-class Destination(msgspec.Struct, frozen=True):
-    """One edge as the recorder knows it."""
-
-    route: Route
-    replicas: int
+    replicas: int = 1
+    """Of the consumer."""
 
     @property
     def takers(self) -> Iterable[int]:
         """Who has to do with a message: each replica, or (-1) any of them."""
-        return (-1,) if self.route.shared else range(self.replicas)
+        return (-1,) if self.shared else range(self.replicas)
 
 
-@dataclass(frozen=True, slots=True)
-class Graph:
+class Graph(GraphKeys, frozen=True, kw_only=True):
     """A checked graph."""
 
-    name: str
-    seed: int
-    view: str | None
     nodes: dict[str, Node]
     """By name."""
-    score: str | None = None
-    tolerances: str | None = None
-    migrations: str | None = None
-    numerical: tuple[str, ...] = NUMERICAL
     layout: Layout = ALONE
-    listen: str | None = None
-    """Where everybody may listen who can call there."""
 
     def host_of(self, stage: str, replica: int) -> str | None:
         """The machine of a process; None where the graph names no machines."""
@@ -241,35 +222,38 @@ class Graph:
 
     def hosts_of_stages(self) -> dict[str, set[str]]:
         """The machines on which each stage has processes."""
-        head = {self.layout.head.name}
-        return {node.name: set(node.placement) or head for node in self.nodes.values()}
+        return {node.name: set(node.placement) or {self.layout.head.name} for node in self.nodes.values()}
 
     def here(self) -> "Graph":
         """The same graph with every process on the machine that starts it."""
         nodes = {name: replace(node, placement=()) for name, node in self.nodes.items()}
-        return replace(self, layout=ALONE, nodes=nodes)
+        return msgspec.structs.replace(self, layout=ALONE, nodes=nodes)
 
     def routes(self, stage: str) -> list[Route]:
         """Every edge that leaves a stage."""
         return [
-            Route(edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port))
+            Route(
+                edge.port, node.name, port, edge.policy, edge.queue, node.shares(port), node.kept(port), node.replicas
+            )
             for node in self.nodes.values()
             for port, edge in node.inputs.items()
             if edge.stage == stage
         ]
 
-    def destinations(self) -> dict[str, tuple[Destination, ...]]:
+    def destinations(self) -> dict[str, tuple[Route, ...]]:
         """Where the messages of every output port go, by ``STAGE/PORT``."""
-        found: dict[str, tuple[Destination, ...]] = {}
+        found: dict[str, tuple[Route, ...]] = {}
         for stage in (*self.nodes, SUPERVISOR):
             for route in self.routes(stage):
                 topic = f"{stage}/{route.output}"
-                found[topic] = (*found.get(topic, ()), Destination(route, self.nodes[route.consumer].replicas))
+                found[topic] = (*found.get(topic, ()), route)
         return found
 
     def outputs_of(self, stage: str) -> dict[str, type[Message]]:
         """Output ports of a stage or of the supervisor."""
-        return {**SUPERVISOR_OUTPUTS, **self.commands()} if stage == SUPERVISOR else self.nodes[stage].type.outputs
+        if stage == SUPERVISOR:
+            return {port_name(Restarted): Restarted, **self.commands()}
+        return self.nodes[stage].type.outputs
 
     def commands(self) -> dict[str, type[Command]]:
         """What the supervisor publishes when a command is called, by output port."""
@@ -306,8 +290,11 @@ def load_graph(path: Path, assignments: tuple[str, ...] = ()) -> Graph:
 def graph_to_json(graph: Graph) -> str:
     """The graph as it runs, every setting written out: what processes are given and recordings keep."""
     stages = {node.name: node_entry(node) for node in graph.nodes.values()}
-    keys = {key: getattr(graph, key) for key in GRAPH_KEYS}
-    return json.dumps({**keys, **graph.layout.to_entry(), "stages": stages}, indent=1)
+    return json.dumps({**_keys_of(graph), **graph.layout.to_entry(), "stages": stages}, indent=1)
+
+
+def _keys_of(graph: GraphKeys) -> dict[str, Any]:
+    return {key: getattr(graph, key) for key in GraphKeys.__struct_fields__}
 
 
 def node_entry(node: Node) -> dict[str, Any]:
@@ -316,19 +303,14 @@ def node_entry(node: Node) -> dict[str, Any]:
         "stage": node.stage,
         "config": {} if node.config is None else msgspec.to_builtins(node.config, enc_hook=str),
         "inputs": {
-            port: {"from": f"{edge.stage}.{edge.port}", "policy": edge.policy, "queue": edge.queue}
-            for port, edge in node.inputs.items()
-            if port not in node.type.commands
+            port: msgspec.to_builtins(edge) for port, edge in node.inputs.items() if port not in node.type.commands
         },
         "commands": list(node.type.commands),
         "shares": [port for port in node.inputs if node.shares(port)],
         "replicas": node.replicas,
         **({"host": dict(Counter(node.placement))} if node.placement else {}),
         "restarts": node.restarts,
-        "heartbeat": node.limits.heartbeat,
-        "timeout": node.limits.timeout,
-        "startup": node.limits.startup,
-        "memory": node.limits.memory,
+        **msgspec.structs.asdict(node.limits),
     }
 
 
@@ -350,43 +332,42 @@ def graph_from_json(text: str, label: str = "graph") -> Graph:
 
 
 def _stated(entry: Any) -> Any:
-    """What a graph file states of a stage, without its host: what is read back runs where it is read."""
-    left_out = ("host", *READ_FROM_CLASSES)
+    """What a graph file states of a stage, without what its class says (``commands``, ``shares``) and without its
+    host: what is read back runs where it is read."""
+    left_out = ("host", "commands", "shares")
     return {key: value for key, value in entry.items() if key not in left_out} if isinstance(entry, dict) else entry
 
 
 def _build(document: Document) -> Graph:
     """Checks a document step by step; each step reports all of its mistakes at once."""
-    graph = _read(GraphEntry, {**document.values, "stages": {}}, document, ())
+    keys = _keys_of(_read(GraphEntry, {**document.values, "stages": {}}, document, ()))
     raw = document.values.get("stages")
     if not isinstance(raw, dict) or not raw:
         raise Refused(f"{document.place('stages')}: expected a mapping of stage names to stages")
-    names = list(cast("dict[str, Any]", raw))
-    entries = dict(_collect(lambda name: (name, _read_entry(document, name)), names))
-    types = dict(_collect(lambda name: (name, _load(document, name, entries[name])), names))
+    names = list[str](raw)
+    entries = _collect(lambda name: _read_entry(document, name), names)
+    types = _collect(lambda name: _load(document, name, entries[name]), names)
     _resolve_settings(document, entries, types)
-    nodes = dict(_collect(lambda name: (name, _node(document, name, entries[name], types[name])), names))
+    nodes = _collect(lambda name: _node(document, name, entries[name], types[name]), names)
     layout = read_layout(document)
-    read_listen(document, layout)
-    checked = Graph(**{key: getattr(graph, key) for key in GRAPH_KEYS}, nodes=nodes, layout=layout)
-    _collect(
-        lambda keys: _check_edge(document, checked, *keys),
-        [(node, port) for node in names for port in nodes[node].inputs],
-    )
-    return checked
+    check_listen(document, layout)
+    graph = Graph(**keys, nodes=nodes, layout=layout)
+    inputs = [(name, port) for name in names for port in nodes[name].inputs]
+    _collect(lambda edge: _check_edge(document, graph, *edge), inputs)
+    return graph
 
 
-def _collect(check: Callable[[K], T], items: Iterable[K]) -> list[T]:
-    """Applies a check to every item and raises all refusals together, one line each."""
-    results: list[T] = []
+def _collect(check: Callable[[K], T], items: Iterable[K]) -> dict[K, T]:
+    """What a check makes of every item; raises all refusals together, one line each."""
+    results: dict[K, T] = {}
     problems: list[str] = []
     for item in items:
         try:
-            results.append(check(item))
+            results[item] = check(item)
         except Refused as refusal:
             problems.append(str(refusal))
     if problems:
-        raise Refused("\n".join(problems))
+        raise Refused("\n".join(dict.fromkeys(problems)))
     return results
 
 
@@ -394,7 +375,6 @@ def _read(kind: type[T], values: Any, document: Document, keys: Keys) -> T:
     """Converts a mapping of the file to a struct or dataclass, naming the key that does not fit."""
     if not isinstance(values, dict):
         raise Refused(f"{document.place(*keys)}: expected a mapping, got {values!r}")
-    values = cast("dict[str, Any]", values)
     known = {field.encode_name for field in msgspec.inspect.type_info(kind).fields}  # type: ignore[union-attr]
     for key in values:
         if key not in known:
@@ -445,14 +425,11 @@ def _read_entry(document: Document, name: str) -> StageEntry:
     return msgspec.structs.replace(entry, inputs=edges)
 
 
-def _read_edge(document: Document, keys: Keys, value: Any) -> EdgeEntry:
-    edge = EdgeEntry(value) if isinstance(value, str) else _read(EdgeEntry, value, document, keys)
+def _read_edge(document: Document, keys: Keys, value: Any) -> Edge:
+    edge = Edge(value) if isinstance(value, str) else _read(Edge, value, document, keys)
     if edge.source.count(".") != 1:
         raise Refused(f"{document.place(*keys)}: {edge.source!r} is not of the form stage.port")
     return edge
-
-
-# ---------------------------------------------------------------------------------------------- classes
 
 
 def _load(document: Document, name: str, entry: StageEntry) -> StageType:
@@ -473,23 +450,17 @@ def _resolve_settings(document: Document, entries: Mapping[str, StageEntry], typ
     """Makes paths absolute, fills ``${stage.key}`` in and refuses what is still missing."""
     _absolute_paths(document, entries, types)
     settings = [(name, key) for name, entry in entries.items() for key in entry.config]
-    _collect(lambda keys: _refuse_missing(document, entries, *keys), settings)
-    _collect(lambda keys: _interpolate(document, entries, *keys), settings)
+    _collect(lambda keys: _fill_in(document, entries, keys), settings)
     _absolute_paths(document, entries, types)
 
 
 def _absolute_paths(document: Document, entries: Mapping[str, StageEntry], types: Mapping[str, StageType]) -> None:
     for name, entry in entries.items():
+        paths = _path_settings(types[name].config)
         for key, value in entry.config.items():
-            if (
-                key in _path_settings(types[name].config)
-                and isinstance(value, str)
-                and "${" not in value
-                and value != MISSING
-            ):
-                entry.config[key] = str(
-                    locate(Path(value).expanduser(), document.folder_of("stages", name, "config", key))
-                )
+            if key in paths and isinstance(value, str) and "${" not in value and value != MISSING:
+                folder = document.folder_of("stages", name, "config", key)
+                entry.config[key] = str(locate(Path(value).expanduser(), folder))
 
 
 def _path_settings(config: type[Any] | None) -> set[str]:
@@ -497,32 +468,26 @@ def _path_settings(config: type[Any] | None) -> set[str]:
     return {name for name, hint in hints.items() if hint is Path or Path in get_args(hint)}
 
 
-def _refuse_missing(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
-    if entries[name].config[key] == MISSING:
-        place = document.place("stages", name, "config", key)
-        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
-
-
-def _interpolate(document: Document, entries: Mapping[str, StageEntry], name: str, key: str) -> None:
+def _fill_in(document: Document, entries: Mapping[str, StageEntry], *keys: tuple[str, str]) -> Any:
+    """Puts what a setting refers to in its place, and the same there first; ``keys`` lead from one to the next."""
+    name, key = keys[-1]
     value = entries[name].config[key]
-    if not isinstance(value, str):
-        return
     place = document.place("stages", name, "config", key)
+    if value == MISSING:
+        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
+    valid = {f"{name}.{key}": (name, key) for name, entry in entries.items() for key in entry.config}
 
-    def replacement(match: re.Match[str]) -> str:
-        return str(_setting(entries, match.group(1), place))
+    def setting(match: re.Match[str]) -> Any:
+        target = valid.get(match[1])
+        if target is None or target in keys:
+            raise Refused(f"{place}: no setting {match[1]!r} to fill in{suggest(match[1], valid)}")
+        return _fill_in(document, entries, *keys, target)
 
-    whole = re.fullmatch(r"\$\{([^}]*)\}", value)
-    filled = _setting(entries, whole.group(1), place) if whole else re.sub(r"\$\{([^}]*)\}", replacement, value)
-    entries[name].config[key] = filled
-
-
-def _setting(entries: Mapping[str, StageEntry], reference: str, place: str) -> Any:
-    stage, _, key = reference.partition(".")
-    valid = [f"{name}.{key}" for name, entry in entries.items() for key in entry.config]
-    if reference not in valid:
-        raise Refused(f"{place}: no setting {reference!r} to fill in{suggest(reference, valid)}")
-    return entries[stage].config[key]
+    if isinstance(value, str):
+        whole = re.fullmatch(REFERENCE, value)
+        filled = setting(whole) if whole else re.sub(REFERENCE, lambda match: str(setting(match)), value)
+        entries[name].config[key] = value = filled
+    return value
 
 
 def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> Node:
@@ -541,7 +506,7 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
         place = document.place(*keys, "replicas")
         raise Refused(f"{place}: {entry.stage} is stateful: replicas would remember different things; valid: 1")
     edges = _edges(document, name, entry, kind)
-    limits = Limits(heartbeat=entry.heartbeat, timeout=entry.timeout, startup=entry.startup, memory=entry.memory)
+    limits = msgspec.convert(entry, Limits, from_attributes=True)
     return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits, placement)
 
 
@@ -576,14 +541,8 @@ def _edges(document: Document, name: str, entry: StageEntry, kind: StageType) ->
     if missing:
         wanted = ", ".join(f"{port} ({kind.inputs[port].type.__name__})" for port in missing)
         raise Refused(f"{document.place(*keys)}: not connected: {wanted}")
-    edges = {port: _edge(cast("EdgeEntry", edge)) for port, edge in entry.inputs.items()}
-    commands = {port: Edge(SUPERVISOR, command_port(name, port), "block", QUEUE) for port in kind.commands}
-    return {**edges, **commands}
-
-
-def _edge(entry: EdgeEntry) -> Edge:
-    stage, port = entry.source.split(".")
-    return Edge(stage, port, entry.policy, entry.queue)
+    commands = {port: Edge(f"{SUPERVISOR}.{command_port(name, port)}") for port in kind.commands}
+    return {**cast("dict[str, Edge]", entry.inputs), **commands}
 
 
 def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
@@ -597,10 +556,11 @@ def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
     if given is None:
         raise Refused(f"{place}: {edge.stage} has no output {edge.port!r}{suggest(edge.port, outputs)}")
     if given is not wanted.type:
-        fitting = ", ".join(_fitting_outputs(graph, wanted)) or "none in this graph"
+        outputs = ((node.name, *output) for node in graph.nodes.values() for output in node.type.outputs.items())
+        fitting = ", ".join(f"{stage}.{port}" for stage, port, kind in outputs if kind is wanted.type)
         raise Refused(
-            f"{place}: expected {wanted.type.__name__}, but {edge.stage}.{edge.port} is {given.__name__}; "
-            f"valid: {fitting}"
+            f"{place}: expected {wanted.type.__name__}, but {edge.source} is {given.__name__}; "
+            f"valid: {fitting or 'none in this graph'}"
         )
     reason = _needs_all(graph.nodes[name], wanted)
     if edge.policy == "latest" and reason:
@@ -610,7 +570,7 @@ def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
 
 def _needs_all(node: Node, port: InputPort) -> str:
     """Why a stage would wait for ever for what is left out on a port; empty where each message is taken by itself."""
-    handler = node.type.handler_of(port.name)
+    handler = node.type.takers[port.name]
     others = ", ".join(other.name for other in handler.inputs if other != port)
     if port.kind == "gather":
         return f"{port.name} gathers every part of a lineage"
@@ -618,13 +578,6 @@ def _needs_all(node: Node, port: InputPort) -> str:
         return f"{handler.name} joins {port.name} with {others} of the same lineage"
     answers = node.replicated or any(issubclass(kind, Part) for kind in node.type.outputs.values())
     return f"{port.name} takes parts, and each is to be answered" if issubclass(port.type, Part) and answers else ""
-
-
-def _fitting_outputs(graph: Graph, wanted: InputPort) -> Iterator[str]:
-    for node in graph.nodes.values():
-        for port, kind in node.type.outputs.items():
-            if kind is wanted.type:
-                yield f"{node.name}.{port}"
 
 
 # ---------------------------------------------------------------------------------------------- published forms

@@ -1,9 +1,8 @@
 """Files that come with installed packages: ``stages/scene/catalogue.yaml`` is found from any folder."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
+from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -52,10 +51,15 @@ def _graph_folders() -> Iterator[Path]:
             yield folder.joinpath(*inner)
 
 
-def _folder(package: str) -> Path | None:
-    """Where an importable package of the top level lies, without importing it; None where there is none."""
+def find(package: str) -> ModuleSpec | None:
+    """What would be imported under a name of the top level; None where there is nothing."""
     try:
-        spec = find_spec(package) if package.isidentifier() else None
+        return find_spec(package) if package.isidentifier() else None
     except (ImportError, ValueError):  # what is running as a script has no spec
         return None
+
+
+def _folder(package: str) -> Path | None:
+    """Where an importable package of the top level lies, without importing it; None where there is none."""
+    spec = find(package)
     return Path(spec.origin).parent if spec and spec.origin and spec.submodule_search_locations else None

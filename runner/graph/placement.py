@@ -10,14 +10,12 @@ A graph file names them, the first is the head::
 router instead of linking to each other: the head's own, or another one by its address.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -194,7 +192,7 @@ def _entries(document: Document) -> Mapping[str, Any]:
         return {}
     if not isinstance(raw, dict) or not raw:
         raise Refused(f"{document.place('hosts')}: expected a mapping of names to addresses, got {raw!r}")
-    return cast("dict[str, Any]", raw)
+    return raw
 
 
 def _read_host(document: Document, name: str, value: object) -> Host:
@@ -243,11 +241,11 @@ def _refuse_open(document: Document, layout: Layout) -> None:
             )
 
 
-def read_listen(document: Document, layout: Layout) -> str | None:
-    """Where others may listen to a graph; raises Refused where that is no address, or not safe without keys."""
+def check_listen(document: Document, layout: Layout) -> None:
+    """Raises Refused where the address at which others may listen to a graph is none, or not safe without keys."""
     value, place = document.values.get("listen"), document.place("listen")
     if value is None:
-        return None
+        return
     protocol, _, address = str(value).partition("/")
     if protocol not in ("tcp", "tls"):
         raise Refused(f"{place}: {value!r}: valid: tcp/127.0.0.1:7447, or with keys tls/ADDRESS:PORT")
@@ -263,7 +261,6 @@ def read_listen(document: Document, layout: Layout) -> str | None:
             f"{place}: {address} is not loopback, and without keys anybody who reaches it could listen; "
             f"valid: tcp/127.0.0.1:{host.port}, or hosts and keys (runner keys init)"
         )
-    return str(value)
 
 
 def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:

@@ -40,14 +40,8 @@ class Handler:
 
     def keeps(self, port: InputPort) -> bool:
         """True for what a join with a part uses again for every part of its lineage."""
-        return port.name in self._kept
-
-    @cached_property
-    def _kept(self) -> frozenset[str]:
         driver = self.driver
-        if driver is None or driver.kind != "one" or not issubclass(driver.type, Part):
-            return frozenset()
-        return frozenset(port.name for port in self.inputs if port != driver)
+        return driver is not None and driver.kind == "one" and issubclass(driver.type, Part) and port != driver
 
 
 @dataclass(frozen=True)
@@ -72,12 +66,9 @@ class StageType:
         """The input ports that ``runner call`` reaches, by name."""
         return {port.name: port.type for port in self.inputs.values() if issubclass(port.type, Command)}
 
-    def handler_of(self, port: str) -> Handler:
-        """The handler that takes what arrives on a port."""
-        return self._handlers[port]
-
     @cached_property
-    def _handlers(self) -> dict[str, Handler]:
+    def takers(self) -> dict[str, Handler]:
+        """The handler that takes what arrives on a port, by its name."""
         return {port.name: handler for handler in self.handlers for port in handler.inputs}
 
 
@@ -107,36 +98,29 @@ def _handler_names(cls: type[Stage]) -> list[str]:
 
 
 def _handler(cls: type[Stage], name: str) -> Handler:
-    hints = _hints(cls, name)
     inputs: list[InputPort] = []
     context: str | None = None
-    for parameter in list(_signature(cls, name).parameters)[1:]:
-        if hints[parameter] is Context:
+    for parameter, annotation in list(_hints(cls, name).items())[:-1]:
+        if annotation is Context:
             context = parameter
         else:
-            inputs.append(_input_port(cls, name, parameter, hints[parameter]))
-    if name == "source" and inputs:
-        raise Refused(f"{cls.__name__}.source({inputs[0].name}): a source takes no messages")
-    _refuse_two_drivers(cls, name, inputs)
-    _refuse_joined_command(cls, name, inputs)
+            inputs.append(_input_port(cls, name, parameter, annotation))
+    _refuse_inputs(cls, name, inputs)
     return Handler(name, tuple(inputs), context)
 
 
-def _signature(cls: type[Stage], name: str) -> inspect.Signature:
-    return inspect.signature(getattr(cls, name))
-
-
 def _hints(cls: type[Stage], name: str) -> dict[str, Any]:
-    """Resolved annotations of a method; every parameter and the result must have one."""
+    """Resolved annotations of a method's parameters, in their order, and of its result; each must have one."""
     method: Callable[..., Any] = getattr(cls, name)
     try:
         hints = get_type_hints(method)
     except NameError as error:
         raise Refused(f"{cls.__name__}.{name}: an annotation cannot be resolved: {error}") from None
-    for parameter in (*list(_signature(cls, name).parameters)[1:], "return"):
+    parameters = (*list(inspect.signature(method).parameters)[1:], "return")
+    for parameter in parameters:
         if parameter not in hints:
             raise Refused(f"{cls.__name__}.{name}({parameter}): has no annotation")
-    return hints
+    return {parameter: hints[parameter] for parameter in parameters}
 
 
 def _input_port(cls: type[Stage], method: str, parameter: str, annotation: Any) -> InputPort:
@@ -151,17 +135,16 @@ def _input_port(cls: type[Stage], method: str, parameter: str, annotation: Any) 
     return InputPort(parameter, item, "gather")
 
 
-def _refuse_two_drivers(cls: type[Stage], method: str, inputs: list[InputPort]) -> None:
+def _refuse_inputs(cls: type[Stage], method: str, inputs: list[InputPort]) -> None:
+    if method == "source" and inputs:
+        raise Refused(f"{cls.__name__}.source({inputs[0].name}): a source takes no messages")
     parts = [port.name for port in inputs if issubclass(port.type, Part) and port.kind == "one"]
     gathers = [port.name for port in inputs if port.kind == "gather"]
     if len(parts) > 1 or (parts and gathers):
         names = ", ".join(parts + gathers)
         raise Refused(f"{cls.__name__}.{method}({names}): a handler takes at most one Part, or gathers lists of them")
 
-
-def _refuse_joined_command(cls: type[Stage], method: str, inputs: list[InputPort]) -> None:
-    """Nothing else hangs on a command: a join with one would wait for ever."""
-    for port in inputs:
+    for port in inputs:  # nothing else hangs on a command: a join with one would wait for ever
         if issubclass(port.type, Command) and len(inputs) > 1:
             raise Refused(f"{cls.__name__}.{method}({port.name}): a command is the only message its handler takes")
 

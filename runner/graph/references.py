@@ -5,7 +5,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import metadata, packages_distributions
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from runner.contract import Migration, Migrations, Refused, Tolerance, Tolerances
 from runner.graph.document import suggest
@@ -18,7 +18,7 @@ def load_class(reference: str, place: str) -> Any:
     module_name, _, class_name = reference.partition(":")
     members = vars(_module(module_name, place))
     if class_name not in members:
-        classes = [name for name, value in members.items() if _is_class_of(value, module_name)]
+        classes = [name for name, one in members.items() if isinstance(one, type) and one.__module__ == module_name]
         raise Refused(f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, classes)}")
     return members[class_name]
 
@@ -26,8 +26,8 @@ def load_class(reference: str, place: str) -> Any:
 def modules_of(graph: Mapping[str, Any]) -> list[str]:
     """The modules of the stages of a graph that may not have been checked, each once."""
     stages = graph.get("stages")
-    entries = cast("dict[str, Any]", stages).values() if isinstance(stages, dict) else ()
-    references = (cast("dict[str, Any]", entry).get("stage") for entry in entries if isinstance(entry, dict))
+    entries = stages.values() if isinstance(stages, dict) else ()
+    references = (entry.get("stage") for entry in entries if isinstance(entry, dict))
     return list(dict.fromkeys(str(reference).partition(":")[0] for reference in references))
 
 
@@ -52,12 +52,12 @@ def _table(
     if not isinstance(table, Mapping):
         tables = [other for other, value in members.items() if isinstance(value, Mapping) and other[:1] != "_"]
         raise Refused(f"{place}: no table {name!r} in {module_name}{suggest(name, tables)}")
-    for found, value in cast("Mapping[Any, Any]", table).items():
+    for found, value in table.items():
         if not key(found):
             raise Refused(f"{place}: {found!r} is no key of such a table; valid: {keys}")
         if not isinstance(value, kind):
             raise Refused(f"{place}: {found} is {value!r}; valid: a runner.contract.{kind.__name__}")
-    return cast("Mapping[Any, T]", table)
+    return table
 
 
 def _is_version(key: Any) -> bool:
@@ -96,7 +96,3 @@ def _modules_beside(module_name: str) -> list[str]:
     except (ImportError, AttributeError):
         return []
     return [f"{package}.{module.name}" for module in pkgutil.iter_modules(paths)]
-
-
-def _is_class_of(value: Any, module_name: str) -> bool:
-    return isinstance(value, type) and value.__module__ == module_name

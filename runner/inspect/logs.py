@@ -22,7 +22,7 @@ def log_lines(path: Path, *, follow: bool) -> Iterator[LogLine]:
         for record in Container(source, str(path)):
             if not isinstance(record, Metadata) and record.topic.startswith(LOG):
                 with contextlib.suppress(CodecError):
-                    yield unpack(LogLine, record.data)
+                    yield unpack(LogLine, record.message.data)
 
 
 def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:

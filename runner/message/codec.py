@@ -1,7 +1,6 @@
 """What goes over the wire and into recordings: msgpack maps, arrays with a checked type and shape, never pickle."""
 
 import math
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
@@ -203,12 +202,12 @@ def _to_wire(value: Any) -> Any:
 def _from_wire(kind: type, value: Any) -> Any:
     """Reads ``[dtype, shape, bytes]`` as a read-only array that owns no copy."""
     if isinstance(value, np.ndarray):  # of a message that is checked before it travels
-        return cast("Any", value)
+        return value
     if getattr(kind, "__origin__", None) is not np.ndarray:
         raise ValueError(f"{kind} cannot be decoded")
     match value:
         case [str() as name, list() as shape, bytes() as data]:
-            return _array(name, cast("list[Any]", shape), data)
+            return _array(name, shape, data)
         case _:
             raise ValueError("expected an array as [dtype, shape, bytes]")
 
@@ -240,11 +239,8 @@ def _check_array(array: np.ndarray, spec: Spec) -> None:
 def _fits(shape: tuple[int, ...], pattern: tuple[int | str, ...]) -> bool:
     if len(shape) != len(pattern):
         return False
-    named: dict[str, int] = {}
-    for extent, want in zip(shape, pattern, strict=True):
-        if extent != (named.setdefault(want, extent) if isinstance(want, str) else want):
-            return False
-    return True
+    named = dict(zip(pattern, shape, strict=True))
+    return shape == tuple(named[want] if isinstance(want, str) else want for want in pattern)
 
 
 def _shape(extents: Iterable[int | str]) -> str:
@@ -331,15 +327,7 @@ def _within(place: str, error: ValueError) -> ValueError:
 # ---------------------------------------------------------------------------------------------- encode, decode
 
 _BINARY = (bytes, bytearray, memoryview)
-_BIN_32 = b"\xc6"
-"""Byte that begins binary data of more than 64 KiB in msgpack; its length follows in four."""
-_CUT = os.urandom(16)
-"""Stands where an array of a message goes; no message can hold it by itself."""
-
-
-@cache
-def _encoder() -> msgspec.msgpack.Encoder:
-    return msgspec.msgpack.Encoder(enc_hook=_to_wire)
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_to_wire)
 
 
 @cache
@@ -349,32 +337,19 @@ def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
 
 def encode(message: Message) -> bytes:
     """The message's bytes; raises CodecError where a field is not what its class declares, or it is too large."""
-    return b"".join(_encode_in_parts(message))
+    return bytes(_encode_after(b"", message))
 
 
-def _encode_in_parts(message: Message, before: int = 0) -> tuple[bytes | memoryview, ...]:
-    """What msgspec would write after so many bytes, cut where large arrays lie: they are parts of their own."""
-    arrays: list[memoryview] = []
-
-    def to_wire(value: Any) -> Any:
-        nonlocal before
-        wire = _to_wire(value)
-        if isinstance(wire, list) and value.nbytes > IN_PLACE_BYTES:
-            before += value.nbytes - len(_CUT)
-            arrays.append(memoryview(wire[2]).cast("B"))
-            wire[2] = msgspec.Raw(_BIN_32 + value.nbytes.to_bytes(4, "big") + _CUT)
-        return cast("Any", wire)
-
+def _encode_after(head: bytes, message: Message) -> bytearray:
+    """What the message's bytes follow, and these: in one piece, in which large arrays are copied once."""
+    payload = bytearray(head)
     try:
         _check_fields(message)
-        body = msgspec.msgpack.Encoder(enc_hook=to_wire).encode(message)
-        _check_size(before + len(body))
+        _ENCODER.encode_into(message, payload, len(head))
+        _check_size(len(payload))
     except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         raise _codec_error(type(message).__name__, error) from None
-    if not arrays:
-        return (body,)
-    first, *others = body.split(_CUT)
-    return (first, *(part for pair in zip(arrays, others, strict=True) for part in pair))
+    return payload
 
 
 def _check_fields(message: Message) -> None:
@@ -387,7 +362,7 @@ def decode(kind: type[M], body: bytes | msgspec.Raw) -> M:
     """Reads one message of a known class; raises CodecError and nothing else, whatever the bytes."""
     message = _decode_in_place(kind, body) if memoryview(body).nbytes > IN_PLACE_BYTES else None
     if message is None:
-        message = _decode(kind, body)
+        message = unpack(kind, body)
     try:
         _check_struct(message)
     except (ValueError, TypeError) as error:
@@ -430,7 +405,7 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
 
 def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many."""
-    payload = _encoder().encode(record)
+    payload = _ENCODER.encode(record)
     try:
         _check_size(len(payload))
     except ValueError as error:
@@ -438,27 +413,21 @@ def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> b
     return payload
 
 
-def unpack(kind: type[R], payload: bytes | memoryview) -> R:
+def unpack(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
     """Reads a record; raises CodecError and nothing else, whatever the bytes."""
-    return _decode(kind, payload)
+    try:
+        _check_size(memoryview(payload).nbytes)
+        return _decoder(kind).decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
+        raise _codec_error(kind.__name__, error) from None
 
 
 class Draft(msgspec.Struct, frozen=True):
-    """An envelope whose body is still in parts: large arrays are not copied, and must not change."""
+    """A message that is ready for its journey."""
 
-    cover: Envelope
-    """All but the body."""
-    head: bytes
-    """The cover's bytes."""
-    body: tuple[bytes | memoryview, ...]
-
-    def sealed(self) -> Envelope:
-        """The envelope, with a body of its own."""
-        return msgspec.structs.replace(self.cover, body=msgspec.Raw(b"".join(self.body)))
-
-    def parts(self) -> tuple[bytes | memoryview, ...]:
-        """What :func:`pack` makes of the envelope: a map whose last value is the body."""
-        return self.head, *self.body
+    envelope: Envelope
+    payload: bytearray
+    """What :func:`pack` makes of the envelope, whose body lies in here."""
 
 
 def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
@@ -466,12 +435,14 @@ def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tupl
     kind = type(message)
     cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
     head = pack(cover)
-    return Draft(cover, head, _encode_in_parts(message, len(head)))
+    payload = _encode_after(head, message)
+    body = msgspec.Raw(memoryview(payload)[len(head) :].toreadonly())
+    return Draft(msgspec.structs.replace(cover, body=body), payload)
 
 
 def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Envelope:
-    """Wraps a message as :func:`draft` does, in one piece."""
-    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).sealed()
+    """Wraps a message as :func:`draft` does; the envelope alone."""
+    return draft(message, id=id, lineage=lineage, time_ns=time_ns, causes=causes).envelope
 
 
 def open_envelope(kind: type[M], sealed: Envelope) -> M:
@@ -489,30 +460,22 @@ class Fields(dict[str, Any]):
 
 def decode_untyped(body: bytes | msgspec.Raw) -> Any:
     """Reads a message without knowing its class: maps as :class:`Fields`, arrays as arrays. Raises CodecError."""
-    return _named(_decode(cast("type[msgspec.Struct]", Any), body))
+    return _named(unpack(cast("type[msgspec.Struct]", Any), body))
 
 
 def _named(value: Any) -> Any:
     match value:
         case dict():
-            return Fields({str(key): _named(inner) for key, inner in cast("dict[Any, Any]", value).items()})
+            return Fields({str(key): _named(inner) for key, inner in value.items()})
         case [str() as name, list() as shape, bytes() as data] if name in DTYPES:
             try:
-                return _array(name, cast("list[Any]", shape), data)
+                return _array(name, shape, data)
             except ValueError as error:
                 raise CodecError("array", "", str(error)) from None
         case list():
-            return [_named(inner) for inner in cast("list[Any]", value)]
+            return [_named(inner) for inner in value]
         case _:
             return value
-
-
-def _decode(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:
-    try:
-        _check_size(memoryview(payload).nbytes)
-        return _decoder(kind).decode(payload)
-    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError, OverflowError) as error:
-        raise _codec_error(kind.__name__, error) from None
 
 
 def _codec_error(type_name: str, error: Exception) -> CodecError:

@@ -144,7 +144,7 @@ class Inbox:
 
     def add(self, arrival: Arrival) -> None:
         """Takes a message; raises Mismatched for a part that contradicts its siblings."""
-        handler = self._node.type.handler_of(arrival.port.name)
+        handler = self._node.type.takers[arrival.port.name]
         if len(handler.inputs) == 1 and arrival.port.kind == "one":
             if self._node.inputs[arrival.port.name].policy == "latest":
                 self._skip_older(handler, arrival.port)

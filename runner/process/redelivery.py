@@ -11,7 +11,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from runner.graph.graph import Destination, Route
+from runner.graph.graph import Route
 from runner.message.codec import Envelope, Step, answered
 from runner.message.packet import Process
 
@@ -53,10 +53,10 @@ class _Waiting:
 class Redelivery:
     """All edges of a run. Not to be called from several threads at once."""
 
-    def __init__(self, topics: Mapping[str, tuple[Destination, ...]], send: Send) -> None:
+    def __init__(self, topics: Mapping[str, tuple[Route, ...]], send: Send) -> None:
         """``topics`` are the edges by the ``STAGE/PORT`` that they come from."""
         self._send = send
-        self._edges = {topic: dict(_edges(destinations)) for topic, destinations in topics.items()}
+        self._edges = {topic: dict(_edges(routes)) for topic, routes in topics.items()}
         self._by_place = {place: waiting for edges in self._edges.values() for place, waiting in edges.items()}
         self._latest = [
             (taker, waiting) for (_, taker, _), waiting in self._by_place.items() if waiting.route.policy == "latest"
@@ -138,7 +138,7 @@ class Redelivery:
             self._send(f"again/{route.consumer}/{replica}/{route.input}", payload, route.policy == "latest")
 
 
-def _edges(destinations: Iterable[Destination]) -> Iterator[tuple[tuple[str, int, str], _Waiting]]:
-    for one in destinations:
-        for taker in one.takers:
-            yield (one.route.consumer, taker, one.route.input), _Waiting(one.route)
+def _edges(routes: Iterable[Route]) -> Iterator[tuple[tuple[str, int, str], _Waiting]]:
+    for route in routes:
+        for taker in route.takers:
+            yield (route.consumer, taker, route.input), _Waiting(route)

@@ -346,7 +346,7 @@ class StageProcess:
         while True:
             self._present = record = _Record(Ready(handler, ()), time.time_ns())
             for draft in record.timed(itertools.islice(emissions, 1)):
-                record.time_ns = draft.cover.time_ns
+                record.time_ns = draft.envelope.time_ns
                 with contextlib.suppress(Stopped):
                     self._emit(draft)
             self._present = None
@@ -357,7 +357,7 @@ class StageProcess:
 
     def _emit(self, draft: Draft) -> None:
         """Sends a message once its consumers have room."""
-        envelope, payload = draft.cover, b"".join(draft.parts())
+        envelope, payload = draft.envelope, draft.payload
         port = MessageId.of(envelope.id).port
         messages, size = self._sent[port]
         self._sent[port] = messages + 1, size + len(payload)
@@ -451,7 +451,7 @@ class _Record:
                 self._computed_ns, self._begun_ns = self.busy_ns, 0
             if draft is None:
                 return
-            self.emitted.append(draft.cover.id)
+            self.emitted.append(draft.envelope.id)
             yield draft
 
     def step(self, process: Process, number: int, left: tuple[tuple[str, str], ...]) -> Step:

@@ -93,7 +93,7 @@ class Executor:
     def run(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Envelope]:
         """Calls a handler as :meth:`drafts` does and yields what it emits in envelopes."""
         for draft in self.drafts(handler, arrivals, time_ns):
-            yield draft.sealed()
+            yield draft.envelope
 
     def drafts(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Draft]:
         """Calls a handler and yields its messages as it emits them.

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol, cast
+from typing import IO, cast
 
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
@@ -26,60 +26,32 @@ _BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowE
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
-    """A place in the file that does not hold what was written there."""
-
-    offset: int
-    reason: str
-
-    def __str__(self) -> str:
-        return f"byte {self.offset}: {self.reason}"
-
-
-@dataclass(frozen=True, slots=True)
 class Entry:
     """One recorded payload and its topic."""
 
     topic: str
-    schema: str
-    """Name of the type."""
-    log_time_ns: int
-    """When the recorder received it, nanoseconds since the epoch."""
-    publish_time_ns: int
-    """Logical time."""
-    sequence: int
-    channel: int
-    """Number of its channel, see :attr:`Container.channels`."""
-    data: bytes
+    message: McapMessage
+    """Its payload ``data``, its ``log_time`` (when the recorder received it, nanoseconds since the epoch),
+    ``publish_time`` (logical) and ``channel_id``, see :attr:`Container.channels`."""
     offset: int
     """Of the chunk or record that holds it, for :meth:`Container.entries_at`."""
-
-
-class Source(Protocol):
-    """What a container is read from: a file, or a :class:`Growing` one."""
-
-    def read(self, size: int, /) -> bytes:
-        """The next ``size`` bytes, fewer only at the end."""
-        ...
-
-    def tell(self) -> int:
-        """Position of the next byte."""
-        ...
 
 
 class Container:
     """The payloads and metadata of one MCAP stream."""
 
-    def __init__(self, stream: Source, name: str) -> None:
-        self.damage: list[Damage] = []
+    def __init__(self, stream: IO[bytes] | Growing, name: str, known: Container | None = None) -> None:
+        """``known`` has read the same file, and knows topics that are named nowhere but at its end."""
+        self.damage: list[str] = []
+        """Places that do not hold what was written there, as ``byte 4711: reason``."""
         self.torn = True
         """True until the end is found where the writer put it."""
         self.unknown = 0
         """Payloads whose topic stood in a part of the file that is damaged."""
         self._stream = stream
         self._name = name
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = known.channels if known else {}
+        self.schemas: dict[int, Schema] = known.schemas if known else {}
 
     def __iter__(self) -> Iterator[Entry | Metadata]:
         """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all."""
@@ -92,17 +64,13 @@ class Container:
                 self.torn = False
                 return
             except _BROKEN as error:
-                self._refuse_foreign(offset, error)
-                self.damage.append(Damage(offset, _reason(error)))
+                if offset == 0 and self._stream.tell() <= 8:
+                    foreign = isinstance(error, InvalidMagic)
+                    what = "not an MCAP file" if foreign else "empty or cut off in its first bytes"
+                    raise Refused(f"{self._name}: {what}") from None
+                self._note(offset, _reason(error))
                 return
             yield from self._entries(record, offset)
-
-    def read_again(self, file: IO[bytes]) -> Iterator[Entry | Metadata]:
-        """Everything once more, now that the topics are known from the file's end too."""
-        file.seek(0)
-        self.damage.clear()
-        self._stream, self.torn, self.unknown = file, True, 0
-        return iter(self)
 
     def entries_at(self, file: IO[bytes], offset: int, end: int | None = None) -> Iterator[Entry]:
         """The entries between two places where records begin, by default those of one chunk; of the same file."""
@@ -118,11 +86,6 @@ class Container:
                 return
             yield from (entry for entry in self._entries(record, at) if isinstance(entry, Entry))
 
-    def _refuse_foreign(self, offset: int, error: Exception) -> None:
-        if offset == 0 and self._stream.tell() <= 8:
-            what = "not an MCAP file" if isinstance(error, InvalidMagic) else "empty or cut off in its first bytes"
-            raise Refused(f"{self._name}: {what}") from None
-
     def _entries(self, record: McapRecord, offset: int) -> Iterator[Entry | Metadata]:
         for inner in self._opened(record, offset) if isinstance(record, Chunk) else (record,):
             match inner:
@@ -133,18 +96,11 @@ class Container:
                 case McapMessage(channel_id=id) if id not in self.channels:
                     self.unknown += 1
                 case McapMessage():
-                    yield self._entry(inner, offset)
+                    yield Entry(self.channels[inner.channel_id].topic, inner, offset)
                 case Metadata():
                     yield inner
                 case _:
                     pass
-
-    def _entry(self, message: McapMessage, offset: int) -> Entry:
-        channel = self.channels[message.channel_id]
-        schema = self.schemas.get(channel.schema_id)
-        times = message.log_time, message.publish_time
-        name = schema.name if schema else ""
-        return Entry(channel.topic, name, *times, message.sequence, channel.id, message.data, offset)
 
     def _opened(self, chunk: Chunk, offset: int) -> Iterable[McapRecord]:
         try:
@@ -161,12 +117,12 @@ class Container:
             return ()
 
     def _note(self, offset: int, reason: str) -> None:
-        damage = Damage(offset, reason)
+        damage = f"byte {offset}: {reason}"
         if damage not in self.damage:
             self.damage.append(damage)
 
 
-def _records(stream: Source, *, skip_magic: bool = False) -> Iterator[McapRecord]:
+def _records(stream: IO[bytes] | Growing, *, skip_magic: bool = False) -> Iterator[McapRecord]:
     source = cast("IO[bytes]", stream)
     return StreamReader(source, skip_magic=skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD).records
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 
 
@@ -59,27 +59,14 @@ class Intervals:
         if self._stops and number == self._stops[-1]:
             self._stops[-1] += 1
             return
-        at = bisect_right(self._starts, number)
-        if at and number < self._stops[at - 1]:
-            return
-        follows = at > 0 and self._stops[at - 1] == number
-        precedes = at < len(self._starts) and self._starts[at] == number + 1
-        if follows and precedes:
-            self._stops[at - 1] = self._stops.pop(at)
-            del self._starts[at]
-        elif follows:
-            self._stops[at - 1] += 1
-        elif precedes:
-            self._starts[at] = number
-        else:
-            self._starts.insert(at, number)
-            self._stops.insert(at, number + 1)
+        touched = slice(bisect_left(self._stops, number), bisect_right(self._starts, number + 1))
+        self._starts[touched] = [min([number, *self._starts[touched]])]
+        self._stops[touched] = [max([number + 1, *self._stops[touched]])]
 
     def discard(self, number: int) -> None:
         """Takes a number out where it is in."""
         at = bisect_right(self._starts, number) - 1
         if at >= 0 and number < self._stops[at]:
-            start, stop = self._starts[at], self._stops[at]
-            rest = [(first, last) for first, last in ((start, number), (number + 1, stop)) if first < last]
-            self._starts[at : at + 1] = [first for first, _ in rest]
-            self._stops[at : at + 1] = [last for _, last in rest]
+            rest = Intervals([(self._starts[at], number), (number + 1, self._stops[at])])
+            self._starts[at : at + 1] = rest._starts
+            self._stops[at : at + 1] = rest._stops

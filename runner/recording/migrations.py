@@ -3,12 +3,10 @@
 Recordings keep their bytes. What a table holds: :class:`runner.contract.Migration`.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import ChainMap
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -36,7 +34,7 @@ def migrated(sealed: Envelope, migrations: Migrations) -> Envelope:
     """A recorded message as its class is today; itself where nothing has become of it."""
     if (sealed.type, sealed.version) not in migrations:
         return sealed
-    fields, version = cast("Fields", msgspec.msgpack.decode(sealed.body)), sealed.version
+    fields, version = msgspec.msgpack.decode(sealed.body), sealed.version
     while (migration := migrations.get((sealed.type, version))) is not None:
         fields, version = _next(fields, migration), version + 1
     return msgspec.structs.replace(sealed, version=version, body=msgspec.Raw(msgspec.msgpack.encode(fields)))
@@ -62,20 +60,18 @@ def without_gained_fields(recorded: Envelope, replayed: Envelope) -> Envelope:
 def _edited(value: Any, path: list[str], name: str | None) -> Any:
     """A copy in which the field at the end of a path has another name, or is gone where that is None."""
     if isinstance(value, list):
-        return [_edited(item, path, name) for item in cast("list[Any]", value)]
+        return [_edited(item, path, name) for item in value]
     if not isinstance(value, dict):
         return value
-    fields = cast("Fields", value)
     if len(path) > 1:
-        return {key: _edited(inner, path[1:], name) if key == path[0] else inner for key, inner in fields.items()}
-    return {name if key == path[0] else key: inner for key, inner in fields.items() if key != path[0] or name}
+        return {key: _edited(inner, path[1:], name) if key == path[0] else inner for key, inner in value.items()}
+    return {name if key == path[0] else key: inner for key, inner in value.items() if key != path[0] or name}
 
 
 def _shared(old: Any, new: Any) -> Any:
     """What is new, as far as it has the fields of what is old, and in their order."""
     if isinstance(old, dict) and isinstance(new, dict):
-        fields = cast("Fields", new)
-        return {key: _shared(inner, fields[key]) for key, inner in cast("Fields", old).items() if key in fields}
-    if isinstance(old, list) and isinstance(new, list) and len(cast("list[Any]", old)) == len(cast("list[Any]", new)):
-        return [_shared(*pair) for pair in zip(cast("list[Any]", old), cast("list[Any]", new), strict=True)]
+        return {key: _shared(inner, new[key]) for key, inner in old.items() if key in new}
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        return [_shared(*pair) for pair in zip(old, new, strict=True)]
     return new

@@ -1,7 +1,5 @@
 """Proves from the records of a recording, one by one in the order of the file, that nothing is missing."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
@@ -77,11 +75,11 @@ class Proof:
 
     def __init__(self, graph: Mapping[str, Any]) -> None:
         """``graph`` is the recorded one; raises msgspec.ValidationError where it is not what is recorded of graphs."""
-        self._stages = msgspec.convert(graph["stages"], dict[str, _Stage])
+        self._stages = msgspec.convert(graph.get("stages"), dict[str, _Stage])
         self._edges = dict(_edges(self._stages))
         names = ((name, replica) for name, stage in self._stages.items() for replica in range(stage.replicas))
-        self._processes = {name: _incarnations() for name in ((SUPERVISOR, 0), *names)}
-        """By stage and replica."""
+        self._processes = {name: defaultdict[int, _Process](_Process) for name in ((SUPERVISOR, 0), *names)}
+        """By stage and replica, and by incarnation."""
         self._recorded = defaultdict[str, Intervals](Intervals)
         """By output port, as all that follow."""
         self._emitted = defaultdict[str, Intervals](Intervals)
@@ -167,10 +165,7 @@ class Proof:
             self._excused[port] |= self._recorded[port] - self._emitted[port]
 
     def _process(self, of: Step | Lost) -> _Process:
-        key = of.stage, of.replica
-        if key not in self._processes:
-            self._processes[key] = _incarnations()
-        return self._processes[key][of.incarnation]
+        return self._processes.setdefault((of.stage, of.replica), defaultdict(_Process))[of.incarnation]
 
     def _want(self, port: str, number: int) -> None:
         if number not in self._recorded[port]:
@@ -262,10 +257,6 @@ def in_short(problems: Iterable[str]) -> str:
     first = list(itertools.islice(rest, FEW))
     more = sum(1 for _ in rest)
     return "; ".join([*first, *([f"and {more} more"] if more else [])])
-
-
-def _incarnations() -> defaultdict[int, _Process]:
-    return defaultdict(_Process)
 
 
 def _edges(stages: Mapping[str, _Stage]) -> Iterator[tuple[tuple[str, str], _Edge]]:

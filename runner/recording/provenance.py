@@ -1,7 +1,6 @@
 """Where and with what a graph ran: package versions, source revision, machine, and the files its settings name."""
 
 import hashlib
-import importlib.util
 import itertools
 import os
 import platform
@@ -16,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 import yaml
 
-from runner.graph.packaged import locate, portable_name
+from runner.graph.packaged import find, locate, portable_name
 from runner.graph.references import modules_of
 
 DISTRIBUTION = "scene-programming"
@@ -78,10 +77,7 @@ def revision(graph: Mapping[str, Any]) -> str:
 
 def _folder_of(package: str) -> Path | None:
     """Where a package or module at the top lies, without importing it."""
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return None
+    spec = find(package)
     places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
     return next((Path(place).parent for place in places if place and Path(place).exists()), None)
 
@@ -134,17 +130,15 @@ def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of everything that a setting of the graph names: files, folders with all that is in them, and YAML files
     with the files they name, for example the catalogue with its meshes."""
     texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
-    files = {text: locate(Path(text), Path()) for text in sorted(texts)}
-    there = {text: file for text, file in files.items() if os.path.exists(file)}  # noqa: PTH110 - takes any text
-    hashes = {text: _hash(_parts(file)) for text, file in there.items()}
-    return {text: found for text, found in hashes.items() if found}
+    parts = {text: _parts(locate(Path(text), Path())) for text in sorted(texts)}
+    return {text: _hash(files) for text, files in parts.items() if files}
 
 
 def _parts(path: Path) -> list[Path]:
     """The files that belong to a setting's file or folder; none where it is neither."""
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112 - takes any text, and Path.is_dir() does not
         return sorted(inner for inner in itertools.islice(path.rglob("*"), HASHED_FILES) if inner.is_file())
-    if not path.is_file():
+    if not os.path.isfile(path):  # noqa: PTH113
         return []
     named = {path.parent / text for text in _texts(_yaml(path))} if path.suffix in (".yaml", ".yml") else set[Path]()
     return [path, *sorted(inner for inner in named if inner.is_file())]
@@ -161,10 +155,10 @@ def _texts(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict):
-        for inner in cast("dict[str, Any]", value).values():
+        for inner in value.values():
             yield from _texts(inner)
     elif isinstance(value, list):
-        for inner in cast("list[Any]", value):
+        for inner in value:
             yield from _texts(inner)
 
 
@@ -172,10 +166,10 @@ def _hash(paths: Sequence[Path]) -> str:
     size = sum(path.stat().st_size for path in paths)
     if size > HASHED_BYTES:
         return f"not hashed, {size} bytes"
-    hashes = [hashlib.sha256(path.read_bytes()) for path in paths]
-    if len(hashes) < 2:
-        return "".join(found.hexdigest() for found in hashes)
-    return hashlib.sha256(b"".join(found.digest() for found in hashes)).hexdigest()
+    first, *others = (hashlib.sha256(path.read_bytes()) for path in paths)
+    if not others:
+        return first.hexdigest()
+    return hashlib.sha256(b"".join(found.digest() for found in (first, *others))).hexdigest()
 
 
 def portable(value: Any, root: Path) -> Any:
@@ -194,8 +188,8 @@ def with_texts(value: Any, change: Callable[[str], str]) -> Any:
         case str():
             return change(value)
         case dict():
-            return {key: with_texts(inner, change) for key, inner in cast("dict[str, Any]", value).items()}
+            return {key: with_texts(inner, change) for key, inner in value.items()}
         case list():
-            return [with_texts(inner, change) for inner in cast("list[Any]", value)]
+            return [with_texts(inner, change) for inner in value]
         case _:
             return value

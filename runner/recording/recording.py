@@ -1,24 +1,23 @@
 """What a recording holds: messages by id, journalled steps, log lines, its origin, and whether it is complete."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Metadata
 
 from runner.contract import Refused
 from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
-from runner.recording.container import Container, Damage, Entry, open_file
+from runner.message.ids import IdText
+from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
 from runner.recording.provenance import fingerprint, numerical
@@ -97,17 +96,17 @@ def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
 
 
-def _decoded(text: str, default: T) -> T:
-    """What a JSON text holds; the default where it is none or of another type."""
+def _decoded(text: str, kind: type[T]) -> T:
+    """What a JSON text holds; nothing (``kind()``) where it is none or of another type."""
     try:
-        return msgspec.json.decode(text, type=type(default))
-    except msgspec.MsgspecError:
-        return default
+        return msgspec.convert(json.loads(text), kind)
+    except (ValueError, msgspec.ValidationError):
+        return kind()
 
 
 def _readable(entry: Entry) -> bool:
     try:
-        unpack(payload_kind(entry.topic), entry.data)
+        unpack(payload_kind(entry.topic), entry.message.data)
     except CodecError:
         return False
     return True
@@ -128,20 +127,19 @@ class Recording:
         """Processes that died."""
         self.repeated: Counter[str] = Counter()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
-        self._open: OrderedDict[int, dict[str, Envelope]] = OrderedDict()
+        self._open = lru_cache(OPEN_CHUNKS)(self._envelopes_at)
         self._order: list[tuple[str, int, Record]] = []
         """Topic, log time and record of all entries in the order of the file."""
         self._misplaced: dict[str, None] = {}
         """Findings: metadata that does not stand where it was written."""
         with open_file(path) as file:
-            self._container = Container(file, str(path))
-            for record in self._container:
-                self._enter(record)
-            if self._container.unknown:
+            self._read(Container(file, str(path)))
+            if self.container.unknown:
+                file.seek(0)
                 self._forget()
-                for record in self._container.read_again(file):
-                    self._enter(record)
-        self._graph = self._read_graph()
+                self._read(Container(file, str(path), self.container))
+        self.graph = self._read_graph()
+        """The graph as it ran, with all settings applied."""
 
     @property
     def run(self) -> dict[str, str]:
@@ -154,34 +152,25 @@ class Recording:
         packages = self.aspect("packages", dict[str, str]())
         return fingerprint(self.aspect("machine", dict[str, str]()), packages, numerical(self.graph))
 
-    @property
-    def graph(self) -> dict[str, Any]:
-        """The graph as it ran, with all settings applied."""
-        return self._graph
-
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
-        try:
-            value = json.loads(self.run[name])
-        except (KeyError, ValueError):
-            return default
-        return value if isinstance(value, type(default)) else default
+        return _decoded(self.run.get(name, ""), type(default)) or default
 
     @property
-    def damage(self) -> list[Damage]:
-        """Where the file does not hold what was written."""
-        return self._container.damage
+    def damage(self) -> list[str]:
+        """Places that do not hold what was written there, as ``byte 4711: reason``."""
+        return self.container.damage
 
     @property
     def torn(self) -> bool:
         """True where the end of the file is missing."""
-        return self._container.torn
+        return self.container.torn
 
     @cached_property
     def verdict(self) -> Verdict:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
-        counts = _decoded(written.get("counts", ""), dict[str, int]()) if VERDICT in self.metadata else None
+        counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason = self._breakage or written.get("reason", "")
         if self._steps_only:
             return Verdict(False, (), reason, counts)
@@ -194,21 +183,10 @@ class Recording:
         reasons = (reason, "" if found in reason else found)
         return Verdict(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
 
-    @property
-    def channels(self) -> Mapping[int, Channel]:
-        """MCAP's channels, by the number that entries give."""
-        return self._container.channels
-
-    @property
-    def schemas(self) -> Mapping[int, Schema]:
-        """MCAP's schemas, by the number that channels give."""
-        return self._container.schemas
-
     def records(self) -> Iterator[Entry | Metadata]:
         """Everything in the file once more, as it was written; what cannot be read is left out."""
         with open_file(self.path) as file:
-            container = Container(file, str(self.path))
-            container.channels.update(self.channels)
+            container = Container(file, str(self.path), self.container)
             yield from (record for record in container if isinstance(record, Metadata) or _readable(record))
 
     def envelope(self, id: str) -> Envelope:
@@ -219,13 +197,7 @@ class Recording:
 
     def recorded(self, id: str) -> Envelope:
         """One message by id, as it was when it was recorded; raises KeyError where it is not."""
-        offset = self.messages[id].offset
-        if offset not in self._open:
-            self._open[offset] = self._envelopes_at(offset)
-        self._open.move_to_end(offset)
-        if len(self._open) > OPEN_CHUNKS:
-            self._open.popitem(last=False)
-        return self._open[offset][id]
+        return self._open(self.messages[id].offset)[id]
 
     def envelopes(self) -> Iterator[Envelope]:
         """Every message in the order of recording."""
@@ -236,14 +208,16 @@ class Recording:
         for entered in (self.metadata, self._misplaced, self.messages, self.repeated, *lists):
             entered.clear()
 
-    def _enter(self, record: Metadata | Entry) -> None:
-        if isinstance(record, Metadata):
-            self._enter_metadata(record)
-            return
-        try:
-            self._enter_entry(record)
-        except CodecError as error:
-            self.damage.append(Damage(record.offset, f"a record of {record.topic}: {error}"))
+    def _read(self, container: Container) -> None:
+        self.container = container
+        for record in container:
+            if isinstance(record, Metadata):
+                self._enter_metadata(record)
+                continue
+            try:
+                self._enter_entry(record)
+            except CodecError as error:
+                self.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
 
     def _enter_metadata(self, record: Metadata) -> None:
         if record.name in self.metadata:
@@ -253,7 +227,8 @@ class Recording:
         self.metadata[record.name] = record.metadata
 
     def _enter_entry(self, entry: Entry) -> None:
-        record = unpack(payload_kind(entry.topic), entry.data)
+        data, time_ns = entry.message.data, entry.message.log_time
+        record = unpack(payload_kind(entry.topic), data)
         match record:
             case Step():
                 if record.outcome != "ended" and record.stage != SUPERVISOR:
@@ -264,19 +239,19 @@ class Recording:
                 self.lost.append(record)
             case Envelope(id=id):
                 self.repeated[id] += id in self.messages
-                where = entry.log_time_ns, len(entry.data), entry.offset
-                self.messages.setdefault(id, Located(id, record.lineage, entry.topic, record.type, *where))
+                located = Located(id, record.lineage, entry.topic, record.type, time_ns, len(data), entry.offset)
+                self.messages.setdefault(id, located)
         if VERDICT in self.metadata:
             self._misplaced[f"metadata {VERDICT!r} does not stand last"] = None
-        self._order.append((entry.topic, entry.log_time_ns, record.id if isinstance(record, Envelope) else record))
+        self._order.append((entry.topic, time_ns, record.id if isinstance(record, Envelope) else record))
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:
         envelopes: dict[str, Envelope] = {}
         with open_file(self.path) as file:
-            for entry in self._container.entries_at(file, offset):
+            for entry in self.container.entries_at(file, offset):
                 if payload_kind(entry.topic) is Envelope:
                     with contextlib.suppress(CodecError):  # noted as damage when the file was read
-                        sealed = unpack(Envelope, entry.data)
+                        sealed = unpack(Envelope, entry.message.data)
                         envelopes.setdefault(sealed.id, sealed)
         return envelopes
 
@@ -306,7 +281,7 @@ class Recording:
         proof = Proof(self.graph)
         for entry in self._order:
             proof.enter(*entry)
-        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[str]()):
+        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof
 
@@ -315,9 +290,6 @@ class Recording:
             damaged = f" ({self.damage[0]})" if self.damage else ""
             raise Refused(f"{self.path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
         graph = self.aspect("graph", dict[str, Any]())
-        stages = graph.get("stages")
-        if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
-            raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph")
         try:
             Proof(graph)
         except msgspec.ValidationError as error:

@@ -1,18 +1,16 @@
 """Writes what a torn or damaged recording still holds as a clean, indexed one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import IO
 
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Refused
-from runner.recording.container import Entry, is_being_written, open_file
+from runner.recording.container import Container, Entry, is_being_written, open_file
 from runner.recording.recording import PROFILE, VERDICT, Recording
+from runner.recording.writer import CHUNK_BYTES
 
 SUFFIX = ".recovered.mcap"
-CHUNK_BYTES = 4 * 2**20
 
 
 def recover(path: Path, target: Path | None = None) -> tuple[Recording, Path]:
@@ -41,10 +39,11 @@ def _copy(recording: Recording, output: IO[bytes]) -> None:
     channels: dict[int, int] = {}
     for record in recording.records():
         if isinstance(record, Entry):
-            if record.channel not in channels:
-                channels[record.channel] = _register(recording, record.channel, writer)
-            times = record.log_time_ns, record.data, record.publish_time_ns, record.sequence
-            writer.add_message(channels[record.channel], *times)
+            message = record.message
+            if message.channel_id not in channels:
+                channels[message.channel_id] = _register(recording.container, message.channel_id, writer)
+            channel = channels[message.channel_id]
+            writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
         elif record.name != VERDICT:
             writer.add_metadata(record.name, record.metadata)
     writer.flush()
@@ -52,8 +51,8 @@ def _copy(recording: Recording, output: IO[bytes]) -> None:
     writer.finish()
 
 
-def _register(recording: Recording, number: int, writer: Writer) -> int:
-    channel = recording.channels[number]
-    schema = recording.schemas.get(channel.schema_id)
+def _register(container: Container, number: int, writer: Writer) -> int:
+    channel = container.channels[number]
+    schema = container.schemas.get(channel.schema_id)
     known = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
     return writer.register_channel(channel.topic, channel.message_encoding, known, channel.metadata)

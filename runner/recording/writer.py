@@ -21,22 +21,13 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Message, Refused
-from runner.graph.graph import Destination
+from runner.graph.graph import Route
 from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.message.ids import MessageId
+from runner.recording import provenance
 from runner.recording.container import Container, hold
 from runner.recording.proof import Proof, Record, in_short
-from runner.recording.provenance import (
-    file_hashes,
-    fingerprint,
-    machine,
-    numerical,
-    package_versions,
-    portable,
-    revision,
-    runner_version,
-)
 from runner.recording.recording import (
     FORMAT,
     JOURNAL,
@@ -66,7 +57,6 @@ Recorded = Envelope | Step | LogLine | Lost
 class Topic(msgspec.Struct, frozen=True):
     """What is recorded under one topic."""
 
-    type: str
     version: int
     schema: dict[str, Any]
 
@@ -90,7 +80,7 @@ class Manifest(msgspec.Struct, frozen=True):
     """None on one machine."""
     steps_only: bool = False
     """Record no messages."""
-    destinations: dict[str, tuple[Destination, ...]] = {}
+    destinations: dict[str, tuple[Route, ...]] = {}
     """Where messages go, by topic."""
     processes: tuple[tuple[str, int], ...] = ()
     """(stage, replica) of every process of the graph."""
@@ -98,13 +88,13 @@ class Manifest(msgspec.Struct, frozen=True):
 
 def topic(kind: type[Message]) -> Topic:
     """Describes the topic of a message type."""
-    return Topic(kind.__name__, kind.version, json_schema(kind))
+    return Topic(kind.version, json_schema(kind))
 
 
 def run_metadata(manifest: Manifest) -> dict[str, str]:
     """What ran where, as the recording keeps it: one JSON text per aspect."""
-    graph = portable(json.loads(manifest.graph), Path.cwd())
-    here, packages = machine(), package_versions()
+    graph = provenance.portable(json.loads(manifest.graph), Path.cwd())
+    here, packages = provenance.machine(), provenance.package_versions()
     return {
         "format": FORMAT,
         "graph": json.dumps(graph),
@@ -113,12 +103,12 @@ def run_metadata(manifest: Manifest) -> dict[str, str]:
         "settings": json.dumps(manifest.settings),
         "records": STEPS_ONLY if manifest.steps_only else "messages and steps",
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "revision": revision(graph),
-        "runner": runner_version(),
+        "revision": provenance.revision(graph),
+        "runner": provenance.runner_version(),
         "packages": json.dumps(packages),
         "machine": json.dumps(here),
-        "fingerprint": fingerprint(here, packages, numerical(graph)),
-        "files": json.dumps(file_hashes(graph)),
+        "fingerprint": provenance.fingerprint(here, packages, provenance.numerical(graph)),
+        "files": json.dumps(provenance.file_hashes(graph)),
     }
 
 
@@ -294,7 +284,8 @@ class RecordingWriter:
         with self._path.open("rb") as file:
             for entry in self._container.entries_at(file, self._proved, end):
                 with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
-                    yield entry.topic, entry.log_time_ns, _named(unpack(payload_kind(entry.topic), entry.data))[1]
+                    record = unpack(payload_kind(entry.topic), entry.message.data)
+                    yield entry.topic, entry.message.log_time, _named(record)[1]
 
     def _write_verdict(self) -> None:
         self._flush()

@@ -97,7 +97,7 @@ class Bus:
         self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
         self._caller.start()
 
-    def publish(self, path: str, payload: bytes, *, may_be_dropped: bool = False) -> None:
+    def publish(self, path: str, payload: bytes | bytearray, *, may_be_dropped: bool = False) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run. Once closed it sends nothing."""
         if self._closed.is_set():
             return

@@ -131,7 +131,7 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
 def _draw_entry(show: Show, entry: Entry) -> None:
     if payload_kind(entry.topic) is Envelope:
         with contextlib.suppress(CodecError):
-            show.draw(unpack(Envelope, entry.data))
+            show.draw(unpack(Envelope, entry.message.data))
 
 
 # ------------------------------------------------------------------------------------ the viewer's process

@@ -75,7 +75,7 @@ class ToyRun:
         for node in self._graph.nodes.values():
             if node.type.source is not None:
                 for draft in self._executors[node.name].advance(node.type.source, time.time_ns):
-                    yield from self._emitted((node.name, 0), "source", (), [draft.sealed()])
+                    yield from self._emitted((node.name, 0), "source", (), [draft.envelope])
         while self._sent:
             yield from self._delivered(self._sent.popleft())
         for process in self._numbers:

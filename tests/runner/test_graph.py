@@ -187,6 +187,13 @@ def test_settings_fill_each_other_in(tmp_path: Path):
     assert graph.nodes["splitter"].config.parts == 4
 
 
+def test_settings_fill_each_other_in_whatever_their_order(tmp_path: Path):
+    chain = ("counter.count=${splitter.parts}", "splitter.parts=${worker.seconds}")
+    assert load(tmp_path, OUT, *chain, "worker.seconds=3").nodes["counter"].config.count == 3
+    with pytest.raises(Refused, match=r"^--set worker.seconds: no setting 'counter.count' to fill in"):
+        load(tmp_path, OUT, *chain, "worker.seconds=${counter.count}")
+
+
 def test_json_is_read_back_as_the_same_graph(tmp_path: Path):
     text = graph_to_json(load(tmp_path, OUT))
     assert graph_to_json(graph_from_json(text)) == text

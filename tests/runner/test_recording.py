@@ -393,6 +393,19 @@ def test_a_flipped_bit_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_pa
         assert "\n" not in str(refused)
 
 
+@pytest.mark.parametrize("damage", [b'["counter.number!1"]', b"[1234567890123456789]"])
+def test_damage_among_the_missing_of_the_verdict_hides_nothing(tmp_path: Path, damage: bytes):
+    path = tmp_path / "gap.mcap"
+    recorder = writer(path)
+    for sequence in (0, 2):
+        recorder.put(Envelope, pack(number(sequence)))
+    recorder.close()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'["counter.number#1"]', damage.ljust(20)))
+    assert path.read_bytes() != content
+    assert Recording(path).verdict.missing == ("counter.number#1",)
+
+
 def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path: Path):
     path = tmp_path / "damaged.mcap"
     recorder = writer(path)

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from runner.graph.graph import Destination, Route
+from runner.graph.graph import Route
 from runner.message.codec import Envelope, Outcome, Step
 from runner.message.packet import Process
 from runner.process import redelivery
@@ -20,8 +20,8 @@ class Recorder:
 
     def __init__(self, replicas: int = 1, **changes: Any) -> None:
         self.sent: list[tuple[str, bytes]] = []
-        destination = Destination(msgspec.structs.replace(ROUTE, **changes), replicas)
-        self.redelivery = Redelivery({TOPIC: (destination,)}, lambda key, payload, _: self.sent.append((key, payload)))
+        route = msgspec.structs.replace(ROUTE, replicas=replicas, **changes)
+        self.redelivery = Redelivery({TOPIC: (route,)}, lambda key, payload, _: self.sent.append((key, payload)))
 
     def message(self, number: int) -> tuple[str, list[tuple[str, str]]]:
         id = f"counter.number#{number}"
