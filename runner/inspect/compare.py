@@ -119,5 +119,9 @@ def _kind(array: NDArray[Any]) -> str:
 
 
 def _show(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+    return clipped(repr(value), SHOWN)
+
+
+def clipped(text: str, length: int) -> str:
+    """A text of at most ``length`` characters, three dots in the place of the rest."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."

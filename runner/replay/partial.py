@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -123,7 +123,7 @@ class PartialReplay:
         self._workers = workers
         self._ranks, self._times = _journal(recording)
         self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
-        self._frozen = _Frozen(recording, names)
+        self.frozen = Frozen(recording, names)
         self._ahead = 0
         self._running: dict[Connection, tuple[_Stage, Key, Worker]] = {}
         self._processes: list[Worker] = []
@@ -134,21 +134,11 @@ class PartialReplay:
         try:
             for child in self._processes:
                 self._await_construction(child)
-            self._start_handlers()
             while self._advance():
                 pass
         finally:
             for child in self._processes:
                 child.kill()
-
-    @property
-    def frozen(self) -> dict[str, Envelope]:
-        """The recorded messages that took part, by id."""
-        return self._frozen.released
-
-    def never_came(self) -> list[str]:
-        """Ids of recorded messages of devices that answered what is not asked any more."""
-        return self._frozen.blocked()
 
     # ------------------------------------------------------------------------------------ processes
 
@@ -158,7 +148,11 @@ class PartialReplay:
         files.mkdir()
         node.prepare()
         idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
-        return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+        stage = _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+        for handler in node.type.handlers:
+            if not handler.inputs:
+                stage.add(Ready(handler, ()))
+        return stage
 
     def _expected(self, node: Node) -> list[Key]:
         """The recorded steps of a stage, in order: the journal's, or where replicas shared them, that of the looks."""
@@ -176,19 +170,13 @@ class PartialReplay:
 
     def _await_construction(self, child: Worker) -> None:
         try:
-            error = msgspec.msgpack.decode(child.receive(), type=Answer).error
+            error = msgspec.msgpack.decode(child.connection.recv_bytes(), type=Answer).error
         except EOFError:
             error = f"{child.log.stem}: {child.end()}"
         if error:
             raise Refused(error)
 
     # ------------------------------------------------------------------------------------ scheduling
-
-    def _start_handlers(self) -> None:
-        for stage in self._stages.values():
-            for handler in stage.node.type.handlers:
-                if not handler.inputs:
-                    stage.add(Ready(handler, ()))
 
     def _advance(self) -> bool:
         """Takes one action; False where there is none left."""
@@ -198,7 +186,9 @@ class PartialReplay:
                 if key is not None:
                     self._dispatch(stage, key)
                     return True
-            if self._ahead < AHEAD and self._release():
+            if self._ahead < AHEAD and (sealed := self.frozen.next()) is not None:
+                self._ahead += bool(self._running)
+                self._deliver(sealed)
                 return True
         if self._running:
             self._collect()
@@ -228,7 +218,7 @@ class PartialReplay:
         connection = cast("Connection", wait(list(self._running))[0])
         stage, key, child = self._running.pop(connection)
         try:
-            answer = msgspec.msgpack.decode(child.receive(), type=Answer)
+            answer = msgspec.msgpack.decode(connection.recv_bytes(), type=Answer)
         except EOFError:
             raise Refused(f"{_step_name(key)}: {child.end()}") from None
         self._ahead = 0
@@ -237,19 +227,11 @@ class PartialReplay:
             self.errors.append(f"{_step_name(key)}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
-            self._frozen.came(sealed.id)
-            self._deliver(sealed, recorded=False)
+            self.frozen.came(sealed.id)
+            self._deliver(sealed)
 
-    def _release(self) -> bool:
-        """Delivers the next message that stays as recorded."""
-        sealed = self._frozen.next()
-        if sealed is not None:
-            self._ahead += bool(self._running)
-            self._deliver(sealed, recorded=True)
-        return sealed is not None
-
-    def _deliver(self, sealed: Envelope, *, recorded: bool) -> None:
-        id = MessageId.of(sealed.id)
+    def _deliver(self, sealed: Envelope) -> None:
+        id, recorded = MessageId.of(sealed.id), sealed.id in self.frozen.released
         for route in self._graph.routes(id.stage):
             stage = self._stages.get(route.consumer)
             if route.output != id.port or stage is None:
@@ -267,7 +249,7 @@ class PartialReplay:
             stage.add(ready)
 
 
-class _Frozen:
+class Frozen:
     """The messages that stay as recorded: each comes once all that it answers has come."""
 
     def __init__(self, recording: Recording, names: Collection[str]) -> None:
@@ -286,8 +268,8 @@ class _Frozen:
         while self._free:
             _, id = heapq.heappop(self._free)
             sealed = self._recording.envelope(id)
-            cause = next(self._lacking(sealed), None)
-            if cause is None:
+            lacking = (one for one in sealed.causes if one in self._positions and one not in self._came)
+            if (cause := next(lacking, None)) is None:
                 self.released[id] = sealed
                 self.came(id)
                 return sealed
@@ -303,9 +285,6 @@ class _Frozen:
     def blocked(self) -> list[str]:
         """What has not come, in order."""
         return sorted((id for ids in self._waiting.values() for id in ids), key=self._positions.__getitem__)
-
-    def _lacking(self, sealed: Envelope) -> Iterator[str]:
-        return (cause for cause in sealed.causes if cause in self._positions and cause not in self._came)
 
 
 def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:

@@ -20,6 +20,7 @@ from runner.contract import Message, Refused, Stage
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
+from runner.inspect.compare import clipped
 from runner.inspect.echo import array_text
 from runner.inspect.info import table
 from runner.message.codec import Envelope, Step, pack
@@ -28,7 +29,16 @@ from runner.process.step import Arrival, arguments_of
 from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
-from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, opened, steps_of
+from runner.replay.tasks import (
+    Execution,
+    Reexecution,
+    Task,
+    envelope_differences,
+    kind_of,
+    opened,
+    process_of,
+    steps_of,
+)
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -54,26 +64,19 @@ def travel(
     recording = Recording(path)
     recording.require_messages()
     graph = change(recording, assignments, swaps)
-    start = _start(recording, graph, until, condition)
+    if until is not None:
+        start = _existing(recording, until)
+    elif condition is not None:
+        start = first_match(recording, graph, condition)
+    else:
+        start = next(iter(recording.messages), None)
     if start is None:
         print(f"{condition!r} holds for no message of {path}")
         return 1
+    prompt = prompt or (sys.stdin.isatty() and sys.stdout.isatty())
     with tempfile.TemporaryDirectory() as folder:
-        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt or _attended())
+        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt)
     return 0
-
-
-def _attended() -> bool:
-    return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _start(recording: Recording, graph: Graph, until: str | None, condition: str | None) -> str | None:
-    """The message to stop at; None where the condition never holds."""
-    if until is not None:
-        return _existing(recording, until)
-    if condition is not None:
-        return first_match(recording, graph, condition)
-    return next(iter(recording.messages), None)
 
 
 def _existing(recording: Recording, id: str) -> str:
@@ -236,9 +239,7 @@ def described(moment: Moment, recording: Recording) -> Iterator[str]:
     sealed = recording.envelope(moment.id)
     yield f"{moment.id}  {sealed.type}, of {sealed.lineage}"
     if moment.step is not None:
-        step = moment.step
-        process = f"{step.stage}[{step.replica}]" + (f" after restart {step.incarnation}" if step.incarnation else "")
-        yield f"  step {step.number} of {process}, {step.handler}"
+        yield f"  step {moment.step.number} of {process_of(moment.step)}, {moment.step.handler}"
     yield from (f"  {note}" for note in moment.notes)
     fields = moment.message.__struct_fields__ if moment.message is not None else ()
     yield from (f"    {name} = {brief(getattr(moment.message, name))}" for name in fields)
@@ -260,12 +261,8 @@ def brief(value: Any) -> str:
     if isinstance(value, list | tuple) and value:
         items = cast("Sequence[Any]", value)
         if isinstance(items[0], msgspec.Struct | np.ndarray):
-            return f"{len(items)} x {_clipped(brief(items[0]))}"
+            return f"{len(items)} x {clipped(brief(items[0]), SHOWN)}"
     if isinstance(value, msgspec.Struct):
         fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
-        return _clipped(f"{type(value).__name__}({', '.join(fields)})")
-    return _clipped(repr(value))
-
-
-def _clipped(text: str) -> str:
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+        return clipped(f"{type(value).__name__}({', '.join(fields)})", SHOWN)
+    return clipped(repr(value), SHOWN)
