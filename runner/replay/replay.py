@@ -17,7 +17,7 @@ from dataclasses import fields, is_dataclass
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -51,7 +51,7 @@ def _swap(document: Document, swap: str) -> None:
     stage, equals, reference = swap.partition("=")
     if not equals or ":" not in reference:
         raise Refused(f"--swap {swap}: expected stage=module:Class, for example --swap ranker=mine:Ranker")
-    stages = cast("dict[str, dict[str, Any]]", document.values["stages"])
+    stages = document.values["stages"]
     if stage not in stages:
         raise Refused(f"--swap {swap}: no stage {stage!r}{suggest(stage, stages)}")
     config = getattr(load_class(reference, f"--swap {swap}"), "Config", None)

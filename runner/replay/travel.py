@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -257,11 +257,9 @@ def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
 def brief(value: Any) -> str:
     """A value in one line."""
     if isinstance(value, np.ndarray):
-        return array_text(cast("np.ndarray[Any, Any]", value))
-    if isinstance(value, list | tuple) and value:
-        items = cast("Sequence[Any]", value)
-        if isinstance(items[0], msgspec.Struct | np.ndarray):
-            return f"{len(items)} x {clipped(brief(items[0]), SHOWN)}"
+        return array_text(value)
+    if isinstance(value, list | tuple) and value and isinstance(value[0], msgspec.Struct | np.ndarray):
+        return f"{len(value)} x {clipped(brief(value[0]), SHOWN)}"
     if isinstance(value, msgspec.Struct):
         fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
         return clipped(f"{type(value).__name__}({', '.join(fields)})", SHOWN)
