@@ -76,8 +76,7 @@ def topics_text(status: RunStatus) -> str:
 
 def from_here(path: str) -> str:
     """A path as a user in this folder would type it."""
-    here = f"{Path.cwd()}{os.sep}"
-    return path.removeprefix(here)
+    return path.removeprefix(f"{Path.cwd()}{os.sep}")
 
 
 # ------------------------------------------------------------------------------------------ rates
@@ -123,7 +122,8 @@ def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> 
             began = began or line.time_ns
             name = f"{line.stage}.{line.replica}" if line.replica else line.stage
             terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    if stage is not None and stage not in seen and not _has_output(recording, stage):
+    printed = (recording.with_suffix("") / "log").glob(f"{stage}-*.txt")
+    if stage is not None and stage not in seen and not any(printed):
         raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
 
 
@@ -134,10 +134,6 @@ def _began(recording: Path) -> int:
         return int(time.mktime(time.strptime(stamp, "%Y%m%d-%H%M%S")) * 1e9)
     except ValueError:
         return 0
-
-
-def _has_output(recording: Path, stage: str) -> bool:
-    return any((recording.with_suffix("") / "log").glob(f"{stage}-*.txt"))
 
 
 def commands_text(commands: Sequence[CommandType], stage: str | None) -> str:

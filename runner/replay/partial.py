@@ -19,7 +19,7 @@ import msgspec
 
 from runner.contract import Refused
 from runner.graph.graph import Graph, Node
-from runner.message.codec import CodecError, Envelope, Step
+from runner.message.codec import CodecError, Envelope
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
@@ -295,16 +295,12 @@ def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
     ranks: dict[Key, int] = {}
     times: dict[Key, int] = {}
     for step in done:
-        place = (step.stage, step.handler, _lineage(recording, step))
+        known = (recording.messages[id].lineage for _, id in step.consumed if id in recording.messages)
+        place = (step.stage, step.handler, next(known, ""))
         key = (*place, counts[place])
         counts[place] += 1
         ranks[key], times[key] = len(ranks), step.time_ns
     return ranks, times
-
-
-def _lineage(recording: Recording, step: Step) -> str:
-    recorded = (id for _, id in step.consumed if id in recording.messages)
-    return next((recording.envelope(id).lineage for id in recorded), "")
 
 
 def _step_name(key: Key) -> str:

@@ -115,7 +115,9 @@ class Reexecution:
         self._recording = recording
         self._node = node
         self.stage = node.construct()
-        numbers = _first_numbers(steps)
+        numbers: dict[str, int] = {}  # where the sequence of each port went on in this incarnation
+        for id in (MessageId.of(id) for step in steps for id in step.emitted):
+            numbers.setdefault(id.port, id.sequence)
         self._executor = Executor(node, self.stage, seed=seed, directory=directory, log=log, numbers=numbers)
         self.seconds = 0.0
 
@@ -274,11 +276,3 @@ def opened(graph: Graph, sealed: Envelope) -> Message | None:
         return open_envelope(kind, sealed) if kind else None
     except CodecError as error:
         raise Refused(f"{sealed.id} cannot be read: {error}") from None
-
-
-def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:
-    """Where the sequence of each port went on in this incarnation."""
-    numbers: dict[str, int] = {}
-    for id in (MessageId.of(id) for step in steps for id in step.emitted):
-        numbers.setdefault(id.port, id.sequence)
-    return numbers

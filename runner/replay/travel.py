@@ -172,9 +172,7 @@ class Traveller:
                 own = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
                 steps = sorted(own, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
-            again = Reexecution(
-                self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
-            )
+            again = Reexecution(self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note)
             self._processes[process] = again.stage, self._executions(again, steps)
         return self._processes[process]
 
@@ -184,7 +182,7 @@ class Traveller:
             self._log.clear()
             yield from again.take(step)
 
-    def _note_log(self, text: str, level: str) -> None:
+    def _note(self, text: str, level: str) -> None:
         self._log.append(f"{level} of the stage: {text}")
 
     def _notes(
@@ -245,13 +243,9 @@ def described(moment: Moment, recording: Recording) -> Iterator[str]:
     yield from (f"    {name} = {brief(getattr(moment.message, name))}" for name in fields)
     if moment.step is not None and moment.step.consumed:
         yield f"  causes (the whole tree: runner why {moment.id} {recording.path})"
-        yield from (f"    {line}" for line in table(("port", "id", "type"), _causes(moment.step, recording))[1:])
-
-
-def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
-    for port, id in step.consumed:
-        located = recording.messages.get(id)
-        yield port, id, located.type if located else "not recorded"
+        known = recording.messages
+        rows = [(port, id, known[id].type if id in known else "not recorded") for port, id in moment.step.consumed]
+        yield from (f"    {line}" for line in table(("port", "id", "type"), rows)[1:])
 
 
 def brief(value: Any) -> str:

@@ -130,16 +130,13 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
 def _start_viewer(port: int, *arguments: str) -> subprocess.Popen[bytes]:
     """A window where there is a display, a page on loopback elsewhere; takes drawings on ``port``."""
     command = [RERUN, "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, *arguments]
-    if not _has_display():
+    display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not display:
         web = _free_port()
         command += ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", MEMORY]
         source = quote(f"rerun+http://127.0.0.1:{port}/proxy", safe="")
         print(f"viewer: http://127.0.0.1:{web}/?url={source} (Ctrl-C closes it)", flush=True)
     return subprocess.Popen(bound(command), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-def _has_display() -> bool:
-    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _wait(viewer: subprocess.Popen[bytes]) -> None:
