@@ -80,9 +80,9 @@ class _Stage:
 
     node: Node
     inbox: Inbox
-    idle: list[Worker]
     expected: deque[Key]
     """The recorded steps that are still to come, in order."""
+    idle: list[Worker] = field(default_factory=list[Worker])
     ready: dict[Key, Ready] = field(default_factory=dict[Key, Ready])
     counts: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
     """Steps that became ready, by handler and lineage."""
@@ -133,7 +133,8 @@ class PartialReplay:
         """Executes until nothing is left to do, and leaves no process behind."""
         try:
             for child in self._processes:
-                self._await_construction(child)
+                if error := _answer_of(child, child.log.stem).error:
+                    raise Refused(error)
             while self._advance():
                 pass
         finally:
@@ -147,8 +148,11 @@ class PartialReplay:
         files = folder / node.name
         files.mkdir()
         node.prepare()
-        idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
-        stage = _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+        stage = _Stage(node, Inbox(node), deque(self._expected(node)))
+        for _ in range(self._workers if node.replicated else 1):
+            log = folder / f"{node.name}-{len(self._processes)}.txt"
+            stage.idle.append(Worker(lambda connection: serve(node, self._graph.seed, files, connection), log))
+            self._processes.append(stage.idle[-1])
         for handler in node.type.handlers:
             if not handler.inputs:
                 stage.add(Ready(handler, ()))
@@ -161,20 +165,6 @@ class PartialReplay:
             return keys
         place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
         return sorted(keys, key=lambda key: (MessageId.of(key[2]), place.get(key[1], len(place)), key[3]))
-
-    def _fork(self, node: Node, files: Path, folder: Path) -> Worker:
-        log = folder / f"{node.name}-{len(self._processes)}.txt"
-        child = Worker(lambda connection: serve(node, self._graph.seed, files, connection), log)
-        self._processes.append(child)
-        return child
-
-    def _await_construction(self, child: Worker) -> None:
-        try:
-            error = msgspec.msgpack.decode(child.connection.recv_bytes(), type=Answer).error
-        except EOFError:
-            error = f"{child.log.stem}: {child.end()}"
-        if error:
-            raise Refused(error)
 
     # ------------------------------------------------------------------------------------ scheduling
 
@@ -215,16 +205,13 @@ class PartialReplay:
         self._running[child.connection] = (stage, key, child)
 
     def _collect(self) -> None:
-        connection = cast("Connection", wait(list(self._running))[0])
-        stage, key, child = self._running.pop(connection)
-        try:
-            answer = msgspec.msgpack.decode(connection.recv_bytes(), type=Answer)
-        except EOFError:
-            raise Refused(f"{_step_name(key)}: {child.end()}") from None
+        stage, key, child = self._running.pop(cast("Connection", wait(list(self._running))[0]))
+        name = f"{key[0]}.{key[1]} of {key[2] or 'the start'}"
+        answer = _answer_of(child, name)
         self._ahead = 0
         stage.idle.append(child)
         if answer.error:
-            self.errors.append(f"{_step_name(key)}: {answer.error}")
+            self.errors.append(f"{name}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
             self.frozen.came(sealed.id)
@@ -247,6 +234,14 @@ class PartialReplay:
             self.errors.append(f"{stage.node.name}.{port}: {sealed.id} refused: {error}")
         while ready := stage.inbox.pop():
             stage.add(ready)
+
+
+def _answer_of(child: Worker, what: str) -> Answer:
+    """What a process sends next; raises Refused where it has ended instead, naming ``what`` it was to do."""
+    try:
+        return msgspec.msgpack.decode(child.connection.recv_bytes(), type=Answer)
+    except EOFError:
+        raise Refused(f"{what}: {child.end()}") from None
 
 
 class Frozen:
@@ -301,8 +296,3 @@ def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
         counts[place] += 1
         ranks[key], times[key] = len(ranks), step.time_ns
     return ranks, times
-
-
-def _step_name(key: Key) -> str:
-    stage, handler, lineage, _ = key
-    return f"{stage}.{handler} of {lineage or 'the start'}"
