@@ -222,14 +222,12 @@ class Comparison:
         """Where two messages differ by more than is allowed, or nothing."""
         self._messages += 1
         recorded = self._recording.envelope(id)
-        if pack(recorded) == pack(replayed):
-            return ""
-        replayed = without_gained_fields(recorded, replayed)
-        if pack(recorded) == pack(replayed):
+        other = what_differs(recorded, replayed)
+        if other is None:
             return ""
         kind = self._node.type.outputs.get(MessageId.of(id).port)
         try:
-            found = list(envelope_differences(kind, recorded, replayed))
+            found = list(envelope_differences(kind, recorded, other))
         except CodecError as error:
             return f"the recorded message cannot be read: {error}"
         self._summary.add(MessageId.of(id).topic, id, found)
@@ -252,6 +250,14 @@ def process_of(step: Step) -> str:
 
 def _after_restart(incarnation: int) -> str:
     return f" after restart {incarnation}" if incarnation else ""
+
+
+def what_differs(recorded: Envelope, replayed: Envelope) -> Envelope | None:
+    """A replayed message as far as the recording speaks of it; None where that is the same to the byte."""
+    if pack(recorded) == pack(replayed):
+        return None
+    replayed = without_gained_fields(recorded, replayed)
+    return None if pack(recorded) == pack(replayed) else replayed
 
 
 def envelope_differences(kind: type[Message] | None, recorded: Envelope, replayed: Envelope) -> Iterator[Difference]:

@@ -23,7 +23,7 @@ from runner.inspect.causes import Causes
 from runner.inspect.compare import clipped
 from runner.inspect.echo import array_text
 from runner.inspect.info import table
-from runner.message.codec import Envelope, Step, pack
+from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, arguments_of
 from runner.recording.recording import Recording, replicated
@@ -38,6 +38,7 @@ from runner.replay.tasks import (
     opened,
     process_of,
     steps_of,
+    what_differs,
 )
 
 SHOWN = 76
@@ -192,10 +193,10 @@ class Traveller:
             yield done.refused or f"the handler raised {done.error}"
         if sealed is None:
             yield "recorded, and not emitted in the replay"
-        elif pack(sealed) == pack(recorded):
+        elif (other := what_differs(recorded, sealed)) is None:
             yield "executed again: identical to the recording"
         else:
-            found = [str(difference) for difference in envelope_differences(kind, recorded, sealed)]
+            found = [str(difference) for difference in envelope_differences(kind, recorded, other)]
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]
 

@@ -15,12 +15,12 @@ from runner.graph.graph import Graph, node_entry
 from runner.graph.references import load_class
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
-from runner.message.codec import Envelope, pack
+from runner.message.codec import Envelope
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 from runner.replay.partial import PartialReplay
 from runner.replay.replay import Say, change
-from runner.replay.tasks import envelope_differences, kind_of, opened
+from runner.replay.tasks import envelope_differences, kind_of, opened, what_differs
 from runner.replay.tolerances import compare_origin
 
 SHOWN = 5
@@ -116,10 +116,10 @@ def effects_of(
         if id not in emitted:
             effects["vanished"].append(id)
             continue
-        before, now = recording.envelope(id), emitted[id]
-        same = pack(before) == pack(now)
-        effects["identical" if same else "changed"].append(id)
-        found = () if same else envelope_differences(kind_of(graph, id), before, now)
+        before = recording.envelope(id)
+        now = what_differs(before, emitted[id])
+        effects["identical" if now is None else "changed"].append(id)
+        found = () if now is None else envelope_differences(kind_of(graph, id), before, now)
         summary.add(MessageId.of(id).topic, id, found)
     effects["appeared"] += (id for id in emitted if id not in recording.messages)
     return effects, summary
