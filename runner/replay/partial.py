@@ -28,6 +28,8 @@ from runner.replay.workers import Worker
 
 AHEAD = 16
 """Recorded messages that are delivered while steps run; more would only wait in memory."""
+END = b""
+"""A request that is the last: the stage is closed."""
 Key = tuple[str, str, str, int]
 """A step by what it is, whatever it consumes: stage, handler, lineage, and how many such steps come before it."""
 
@@ -57,7 +59,7 @@ def serve(node: Node, seed: int, directory: Path, connection: Connection) -> Non
         return
     executor = Executor(node, stage, seed=seed, directory=directory, log=lambda *_: None)
     connection.send_bytes(msgspec.msgpack.encode(Answer()))
-    while request := connection.recv_bytes():
+    while (request := connection.recv_bytes()) != END:
         answer = _answer(node, executor, msgspec.msgpack.decode(request, type=Request))
         connection.send_bytes(msgspec.msgpack.encode(answer))
     stage.close()
@@ -137,6 +139,10 @@ class PartialReplay:
                     raise Refused(error)
             while self._advance():
                 pass
+            for child in self._processes:
+                child.send(END)
+            for child in self._processes:
+                child.end()
         finally:
             for child in self._processes:
                 child.kill()
@@ -201,7 +207,7 @@ class PartialReplay:
         ready, child = stage.take(key)
         inputs = tuple((arrival.port.name, arrival.envelope) for arrival in ready.arrivals)
         time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
-        child.connection.send_bytes(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
+        child.send(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
         self._running[child.connection] = (stage, key, child)
 
     def _collect(self) -> None:
@@ -240,7 +246,7 @@ def _answer_of(child: Worker, what: str) -> Answer:
     """What a process sends next; raises Refused where it has ended instead, naming ``what`` it was to do."""
     try:
         return msgspec.msgpack.decode(child.connection.recv_bytes(), type=Answer)
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         raise Refused(f"{what}: {child.end()}") from None
 
 

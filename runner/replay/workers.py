@@ -38,6 +38,11 @@ class Worker(Forked):
         super().__init__(fork(begin, log))
         theirs.close()
 
+    def send(self, request: bytes) -> None:
+        """To one that has ended nothing is sent: who receives next is told."""
+        with suppress(BrokenPipeError):
+            self.connection.send_bytes(request)
+
     def end(self) -> str:
         """Waits for a process that has nothing more to say, and says how it ended."""
         self.connection.close()
