@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -56,21 +57,17 @@ def _process_row(process: ProcessStatus) -> Sequence[str]:
 
 def topics_text(status: RunStatus) -> str:
     """Every topic with its type, what has flowed and what flows now."""
-    flows: dict[str, list[Flow]] = {}
+    flows: dict[str, list[Flow]] = defaultdict(list)
     for process in status.processes:
         for port, flow in process.sent.items():
-            flows.setdefault(f"{process.stage}/{port}", []).append(flow)
-    rows = [
-        (
-            topic.topic,
-            topic.type,
-            str(status.published.get(topic.topic, 0) + sum(flow.messages for flow in flows.get(topic.topic, ()))),
-            f"{sum(flow.per_second for flow in flows.get(topic.topic, ())):.1f}",
-            byte_count(sum(flow.bytes_per_second for flow in flows.get(topic.topic, ()))),
-            ", ".join(topic.consumers) or "nobody",
-        )
-        for topic in status.topics
-    ]
+            flows[f"{process.stage}/{port}"].append(flow)
+    rows: list[Sequence[str]] = []
+    for topic in status.topics:
+        own = flows[topic.topic]
+        sent = status.published.get(topic.topic, 0) + sum(flow.messages for flow in own)
+        rate, size = sum(flow.per_second for flow in own), sum(flow.bytes_per_second for flow in own)
+        consumers = ", ".join(topic.consumers) or "nobody"
+        rows.append((topic.topic, topic.type, str(sent), f"{rate:.1f}", byte_count(size), consumers))
     return "\n".join(table(("topic", "type", "sent", "per second", "bytes/s", "goes to"), rows))
 
 

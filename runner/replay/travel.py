@@ -149,8 +149,7 @@ class Traveller:
 
     def moment(self, id: str) -> Moment:
         """Executes the stage that emitted a message up to it."""
-        step, kind = self._causes.step_of(id), kind_of(self._graph, id)
-        recorded = self._recording.envelope(id)
+        step, recorded = self._causes.step_of(id), self._recording.envelope(id)
         node = self._graph.nodes.get(MessageId.of(id).stage)
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
@@ -159,7 +158,7 @@ class Traveller:
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
         message = opened(self._graph, sealed) if sealed else None
-        notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
+        notes = [*self._notes(execution, recorded, sealed), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
 
     def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
@@ -173,7 +172,7 @@ class Traveller:
                 own = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
                 steps = sorted(own, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
-            again = Reexecution(self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note)
+            again = Reexecution(self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._hear)
             self._processes[process] = again.stage, self._executions(again, steps)
         return self._processes[process]
 
@@ -183,12 +182,10 @@ class Traveller:
             self._log.clear()
             yield from again.take(step)
 
-    def _note(self, text: str, level: str) -> None:
+    def _hear(self, text: str, level: str) -> None:
         self._log.append(f"{level} of the stage: {text}")
 
-    def _notes(
-        self, done: Execution, recorded: Envelope, sealed: Envelope | None, kind: type[Message] | None
-    ) -> Iterator[str]:
+    def _notes(self, done: Execution, recorded: Envelope, sealed: Envelope | None) -> Iterator[str]:
         if done.refused or done.error:
             yield done.refused or f"the handler raised {done.error}"
         if sealed is None:
@@ -196,6 +193,7 @@ class Traveller:
         elif (other := what_differs(recorded, sealed)) is None:
             yield "executed again: identical to the recording"
         else:
+            kind = kind_of(self._graph, recorded.id)
             found = [str(difference) for difference in envelope_differences(kind, recorded, other)]
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]

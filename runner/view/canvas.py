@@ -19,14 +19,12 @@ TIME = "time"
 class Canvas:
     """One Rerun stream with a ``step`` timeline (one step per message or animation frame) and the logical ``time``."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self.stream = stream
-        self._step = -1
-
-    def start(self, layout: d.Layout, static: Iterable[d.Drawing]) -> None:
+    def __init__(self, stream: rr.RecordingStream, views: d.Views) -> None:
         """Sends the arrangement of the panels and what never changes."""
-        self.stream.send_blueprint(_blueprint(layout), make_active=True, make_default=True)
-        for drawing in static:
+        self._stream = stream
+        self._step = -1
+        stream.send_blueprint(_blueprint(views.layout()), make_active=True, make_default=True)
+        for drawing in views.static():
             self._put(drawing, static=True)
 
     def show(self, drawings: Iterable[d.Drawing], *, time_ns: int) -> None:
@@ -41,13 +39,13 @@ class Canvas:
 
     def _advance(self, time_ns: int) -> None:
         self._step += 1
-        self.stream.set_time(STEP, sequence=self._step)
-        self.stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
+        self._stream.set_time(STEP, sequence=self._step)
+        self._stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
         found = _ARCHETYPES[type(drawing)](drawing)
         for archetype in found if isinstance(found, list) else [found]:
-            self.stream.log(drawing.path, archetype, static=static)
+            self._stream.log(drawing.path, archetype, static=static)
 
 
 def _depth(depth: d.DepthImage) -> rr.DepthImage:

@@ -46,8 +46,7 @@ class Show:
         """``path`` is the recording's. Raises Refused where the graph has no views."""
         self._graph = graph_from_json(graph_json, str(path))
         self._views = load_views(self._graph)
-        self._canvas = Canvas(stream)
-        self._canvas.start(self._views.layout(), self._views.static())
+        self._canvas = Canvas(stream, self._views)
 
     def draw(self, sealed: Envelope) -> None:
         """Draws one message; what cannot be drawn is named on stderr and left out."""
