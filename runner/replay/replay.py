@@ -33,8 +33,6 @@ from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
 from runner.replay.tolerances import compare_origin
 from runner.replay.workers import run_each
 
-Say = Callable[[str], None]
-
 
 def change(recording: Recording, assignments: Sequence[str] = (), swaps: Sequence[str] = ()) -> Graph:
     """The recorded graph with other settings and classes."""
@@ -60,8 +58,8 @@ def _swap(document: Document, swap: str) -> None:
     stages[stage] |= {"stage": reference, "config": kept}
 
 
-def plan(path: Path, say: Say) -> int:
-    """Says what a replay would execute."""
+def plan(path: Path) -> list[str]:
+    """What a replay would execute, as lines."""
     recording = Recording(path)
     recording.require_messages()
     rows: list[tuple[str, ...]] = []
@@ -69,23 +67,20 @@ def plan(path: Path, say: Say) -> int:
         steps = [step for step in recording.steps if step.stage == name]
         treatment = "device: its messages are taken from the recording" if node.type.cls.device else "executed again"
         rows.append((name, treatment, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
-    for line in (f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)):
-        say(line)
-    return 0
+    return [f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)]
 
 
-def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: Say) -> int:
+def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> int:
     """Executes everything again in ``workers`` processes at a time (None: one a core) and compares every byte.
 
-    Returns 0 where every message is identical, or where this machine is another and every message within the
-    graph's tolerances; else 1. Raises Refused where the file is no recording.
+    Prints what comes of it. Returns 0 where every message is identical, or where this machine is another and every
+    message within the graph's tolerances; else 1. Raises Refused where the file is no recording.
     """
     began = time.perf_counter()
     recording = Recording(path)
     recording.require_messages()
     same, changes = compare_origin(recording)
-    for line in (*changes, f"{path}: {recording.verdict}"):
-        say(line)
+    print(*changes, f"{path}: {recording.verdict}", sep="\n")
     values, tolerances = recording.graph, dict[str, Tolerance]()
     if assignments or not same:  # else it was checked when it was recorded: classes are imported as they come
         graph = change(recording, assignments)
@@ -94,12 +89,11 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: 
             tolerances = load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
     results: dict[Task, Result] = {}
     for task, result in _Verification(recording, values, tolerances).results(workers or len(os.sched_getaffinity(0))):
-        say(f"{task}: {result}")
+        print(f"{task}: {result}")
         results[task] = result
     found = Summary(change for result in results.values() for change in result.changes)
     code, verdict = _verdict(recording, values, results)
-    for line in (*found.lines(), _cost(recording, results, time.perf_counter() - began), verdict):
-        say(line)
+    print(*found.lines(), _cost(recording, results, time.perf_counter() - began), verdict, sep="\n")
     return code
 
 

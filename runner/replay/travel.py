@@ -50,12 +50,12 @@ PROMPT = "[Enter] next message, p prompt, q quit > "
 def travel(
     path: Path,
     *,
-    assignments: Sequence[str] = (),
-    swaps: Sequence[str] = (),
-    until: str | None = None,
-    condition: str | None = None,
-    step: bool = False,
-    prompt: bool = False,
+    assignments: Sequence[str],
+    swaps: Sequence[str],
+    until: str | None,
+    condition: str | None,
+    step: bool,
+    prompt: bool,
 ) -> int:
     """Stops at message ``until``, or where ``condition`` first holds, or with ``step`` at one message after another.
 

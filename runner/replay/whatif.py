@@ -19,7 +19,7 @@ from runner.message.codec import Envelope
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 from runner.replay.partial import PartialReplay
-from runner.replay.replay import Say, change
+from runner.replay.replay import change
 from runner.replay.tasks import envelope_differences, kind_of, opened, what_differs
 from runner.replay.tolerances import compare_origin
 
@@ -34,13 +34,12 @@ DIFFERENT: tuple[Effect, ...] = EFFECTS[1:]
 def what_if(
     path: Path,
     *,
-    assignments: Sequence[str] = (),
-    swaps: Sequence[str] = (),
-    origins: Sequence[str] = (),
-    workers: int | None = None,
-    say: Say,
+    assignments: Sequence[str],
+    swaps: Sequence[str],
+    origins: Sequence[str],
+    workers: int | None,
 ) -> int:
-    """Executes what follows from a change again and says what it changes.
+    """Executes what follows from a change again and prints what it changes.
 
     ``assignments`` are ``--set``'s, ``swaps`` are ``stage=module:Class``, ``origins`` stages that are executed though
     nothing about them changes. Returns 0, or 1 where a handler raised. Raises Refused where the change is impossible.
@@ -52,14 +51,13 @@ def what_if(
     _, changes = compare_origin(recording)
     frozen = ", ".join(name for name in graph.nodes if name not in names)
     what = f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
-    for line in (*changes, f"{path}: {recording.verdict}", what):
-        say(line)
+    print(*changes, f"{path}: {recording.verdict}", what, sep="\n")
     with tempfile.TemporaryDirectory() as folder:
         workers = workers or len(os.sched_getaffinity(0))
         replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
         replay.run()
     for line in _verdict(recording, graph, names, replay):
-        say(line)
+        print(line)
     return int(bool(replay.errors))
 
 

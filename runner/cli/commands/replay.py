@@ -44,7 +44,8 @@ def _replay(options: argparse.Namespace) -> int | None:
         return _in_clean_process(options, _verify)
     from runner.replay.replay import plan
 
-    return plan(options.file, print)
+    print(*plan(options.file), sep="\n")
+    return None
 
 
 def _in_clean_process(options: argparse.Namespace, command: Command) -> int | None:
@@ -62,7 +63,7 @@ def _in_clean_process(options: argparse.Namespace, command: Command) -> int | No
 def _verify(options: argparse.Namespace) -> int:
     from runner.replay.replay import verify
 
-    return verify(options.file, options.settings, workers=options.workers, say=print)
+    return verify(options.file, options.settings, workers=options.workers)
 
 
 def _what_if(options: argparse.Namespace) -> int:
@@ -76,7 +77,6 @@ def _what_if(options: argparse.Namespace) -> int:
         swaps=options.swaps,
         origins=options.origins,
         workers=options.workers,
-        say=print,
     )
 
 
@@ -89,7 +89,7 @@ def _travel(options: argparse.Namespace) -> int:
         raise Refused("--until and --break each say where to stop; give one")
     return travel(
         options.file,
-        assignments=[*options.settings],
+        assignments=options.settings,
         swaps=options.swaps,
         until=options.until,
         condition=options.condition,
