@@ -17,7 +17,6 @@ from runner.recording.recording import Recording
 HEADER = ("lineage", "type", "version", "causes")
 """What is compared of an envelope beside its body. Logical times of devices are the wall clock's: those of two runs
 always differ."""
-IDENTICAL, DIFFERENT = 0, 1
 
 
 def diff(a: Path, b: Path) -> int:
@@ -34,7 +33,7 @@ def diff(a: Path, b: Path) -> int:
     for block in (_counts(first, second), summary.lines()):
         if block:
             print("", *block, sep="\n")
-    return DIFFERENT if found else IDENTICAL
+    return int(bool(found))
 
 
 def _found(first: Recording, second: Recording, summary: Summary) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from runner.inspect.causes import Causes, last_recorded
 from runner.inspect.info import Cells, seconds, table
 from runner.message.codec import Step
 from runner.message.ids import MessageId
-from runner.recording.recording import Recording
+from runner.recording.recording import Located, Recording
 
 PATHS = 20
 """Critical paths that are shown, the longest first."""
@@ -49,19 +50,17 @@ def latency(path: Path) -> list[str]:
 
 def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
     """One per lineage that a step followed on, the longest first."""
-    lineages: dict[str, list[str]] = defaultdict(list)
+    lineages: dict[str, list[Located]] = defaultdict(list)
     for message in recording.messages.values():
-        lineages[message.lineage].append(message.id)
-    paths = [_critical_path(recording, causes, lineage, ids) for lineage, ids in lineages.items()]
-    return sorted((path for path in paths if path.hops), key=lambda path: -path.elapsed_ns)
-
-
-def _critical_path(recording: Recording, causes: Causes, lineage: str, ids: Sequence[str]) -> CriticalPath:
-    received = {id: recording.messages[id].log_time_ns for id in ids}
-    last = max(ids, key=lambda id: received[id])
-    steps = (causes.step_of(id) for id in causes.path_to(last)[1:])
-    hops = tuple(step for step in steps if step is not None)
-    return CriticalPath(lineage, last, received[last] - min(received.values()), hops)
+        lineages[message.lineage].append(message)
+    paths: list[CriticalPath] = []
+    received = attrgetter("log_time_ns")
+    for lineage, messages in lineages.items():
+        first, last = min(messages, key=received), max(messages, key=received)
+        steps = (causes.step_of(id) for id in causes.path_to(last.id)[1:])
+        if hops := tuple(step for step in steps if step is not None):
+            paths.append(CriticalPath(lineage, last.id, last.log_time_ns - first.log_time_ns, hops))
+    return sorted(paths, key=lambda path: -path.elapsed_ns)
 
 
 # ------------------------------------------------------------------------------------ tables
