@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import platform
 import re
 import resource
 import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -52,19 +53,20 @@ class Finding:
 
 def examine(recordings: Path) -> Iterator[Finding]:
     """Every finding, in the order of what a run needs first; a check that breaks is a finding too."""
-    checks: tuple[tuple[str, Callable[[], Iterable[Finding]]], ...] = (
-        ("python", _python),
+    version, cores = platform.python_version(), os.cpu_count()
+    checks: tuple[tuple[str, Callable[[], Finding]], ...] = (
+        ("python", lambda: Finding("good", "python", f"{version}, {cores} cores")),
         ("packages", _packages),
         ("loopback", _loopback),
         ("zenoh", _zenoh),
-        ("runs", _runs),
+        ("runs", lambda: Finding("good", "runs", f"are listed in {runtime_folder()}")),
         ("recordings", lambda: _recordings(recordings)),
         ("memory", _memory),
         ("limits", _limits),
     )
     for subject, check in checks:
         try:
-            yield from check()
+            yield check()
         except Exception as error:  # one that was not foreseen is worth knowing and no reason to stop
             yield Finding("bad", subject, f"{type(error).__name__}: {error}")
 
@@ -110,12 +112,7 @@ def answer() -> None:
 # ------------------------------------------------------------------------------------------ versions
 
 
-def _python() -> Iterator[Finding]:
-    version = ".".join(map(str, sys.version_info[:3]))
-    yield Finding("good", "python", f"{version}, {os.cpu_count()} cores")
-
-
-def _packages() -> Iterator[Finding]:
+def _packages() -> Finding:
     """What the project needs, by its own metadata; what it was tested with, where the list lies beside it."""
     (project, *_) = importlib.metadata.packages_distributions()["runner"]
     requirements = importlib.metadata.requires(project) or ()
@@ -124,17 +121,15 @@ def _packages() -> Iterator[Finding]:
     tested = _tested()
     install = f"{sys.executable} -m pip install {'--constraint constraints.txt --editable .' if tested else project}"
     if absent:
-        yield Finding("bad", "packages", f"missing: {', '.join(absent)}", install)
-        return
+        return Finding("bad", "packages", f"missing: {', '.join(absent)}", install)
     other = [
         f"{name} {_version(name)} instead of {tested[key]}"
         for name in needed
         if tested.get(key := _key(name)) not in (None, _version(name))
     ]
     if other:
-        yield Finding("note", "packages", f"not the tested versions: {', '.join(other)}", install)
-    else:
-        yield Finding("good", "packages", f"{len(needed)} needed, {len(needed) if tested else 'none'} known as tested")
+        return Finding("note", "packages", f"not the tested versions: {', '.join(other)}", install)
+    return Finding("good", "packages", f"{len(needed)} needed, {len(needed) if tested else 'none'} known as tested")
 
 
 def _version(name: str) -> str | None:
@@ -158,16 +153,16 @@ def _key(name: str) -> str:
 # ------------------------------------------------------------------------------------------ transport
 
 
-def _loopback() -> Iterator[Finding]:
+def _loopback() -> Finding:
     with socket.socket() as server, socket.socket() as client:
         server.bind(("127.0.0.1", 0))
         server.listen()
         client.settimeout(5)
         client.connect(server.getsockname())
-        yield Finding("good", "loopback", f"127.0.0.1:{server.getsockname()[1]} takes calls")
+        return Finding("good", "loopback", f"127.0.0.1:{server.getsockname()[1]} takes calls")
 
 
-def _zenoh() -> Iterator[Finding]:
+def _zenoh() -> Finding:
     """Two sessions as two processes of a graph would have them, and a question from one to the other."""
     version = importlib.metadata.version("eclipse-zenoh")
     endpoint = new_endpoint()
@@ -178,40 +173,34 @@ def _zenoh() -> Iterator[Finding]:
         client.close()
         server.close()
     except Refused as refusal:
-        yield Finding("bad", "zenoh", f"{version}: two sessions do not meet: {refusal}")
-        return
+        return Finding("bad", "zenoh", f"{version}: two sessions do not meet: {refusal}")
     finally:
         remove_sockets(endpoint)
-    yield Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet at a socket")
-
-
-def _runs() -> Iterator[Finding]:
-    yield Finding("good", "runs", f"are listed in {runtime_folder()}")
+    return Finding("good" if answer == b"well" else "bad", "zenoh", f"{version}: two sessions meet at a socket")
 
 
 # ------------------------------------------------------------------------------------------ resources
 
 
-def _recordings(folder: Path) -> Iterator[Finding]:
+def _recordings(folder: Path) -> Finding:
     beside = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not os.access(beside, os.W_OK):
-        yield Finding("bad", "recordings", f"{beside} cannot be written", "runner up GRAPH --recordings DIR")
-        return
+        return Finding("bad", "recordings", f"{beside} cannot be written", "runner up GRAPH --recordings DIR")
     free = shutil.disk_usage(beside).free
-    judgement: Judgement = "good" if free >= LEAST_DISK else "bad"
-    remedy = "" if judgement == "good" else "remove old recordings, or runner up GRAPH --recordings DIR"
-    yield Finding(judgement, "recordings", f"{byte_count(free)} free in {from_here(str(beside))}", remedy)
+    remedy = "" if free >= LEAST_DISK else "remove old recordings, or runner up GRAPH --recordings DIR"
+    return Finding(
+        "bad" if remedy else "good", "recordings", f"{byte_count(free)} free in {from_here(str(beside))}", remedy
+    )
 
 
-def _memory() -> Iterator[Finding]:
+def _memory() -> Finding:
     available = psutil.virtual_memory().available
     limit, used = _group("memory.max"), _group("memory.current")
     if limit is not None and used is not None:
         available = min(available, limit - used)
-    enough = available >= LEAST_MEMORY
     group = f", the control group allows {byte_count(limit)}" if limit is not None else ""
-    remedy = "" if enough else "end other programs, or give the container more memory"
-    yield Finding("good" if enough else "bad", "memory", f"{byte_count(available)} available{group}", remedy)
+    remedy = "" if available >= LEAST_MEMORY else "end other programs, or give the container more memory"
+    return Finding("bad" if remedy else "good", "memory", f"{byte_count(available)} available{group}", remedy)
 
 
 def _group(name: str) -> int | None:
@@ -224,15 +213,14 @@ def _group(name: str) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def _limits() -> Iterator[Finding]:
+def _limits() -> Finding:
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     processes, _ = resource.getrlimit(resource.RLIMIT_NPROC)
     threads = [limit for limit in (processes, _group("pids.max")) if limit not in (None, resource.RLIM_INFINITY)]
     least = min(threads, default=None)
     if files < LEAST_FILES:
-        yield Finding("bad", "limits", f"{files} open files, {LEAST_FILES} are needed", f"ulimit -n {LEAST_FILES}")
-    elif least is not None and least < LEAST_PROCESSES:
+        return Finding("bad", "limits", f"{files} open files, {LEAST_FILES} are needed", f"ulimit -n {LEAST_FILES}")
+    if least is not None and least < LEAST_PROCESSES:
         text = f"{least} processes and threads, {LEAST_PROCESSES} are needed"
-        yield Finding("bad", "limits", text, f"ulimit -u {LEAST_PROCESSES}")
-    else:
-        yield Finding("good", "limits", f"{files} open files, {least or 'any number of'} processes and threads")
+        return Finding("bad", "limits", text, f"ulimit -u {LEAST_PROCESSES}")
+    return Finding("good", "limits", f"{files} open files, {least or 'any number of'} processes and threads")

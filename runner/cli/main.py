@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = built.parse_args(arguments)
         options.arguments = list(sys.argv[1:] if arguments is None else arguments)
         command: Command = options.command
-        return command(options)
+        return command(options) or 0
     except Refused as refusal:
         print(refusal, file=sys.stderr)
         return EXIT_REFUSED

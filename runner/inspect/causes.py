@@ -8,7 +8,6 @@ from runner.contract import Refused
 from runner.graph.document import suggest
 from runner.inspect.info import seconds
 from runner.message.codec import Step
-from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 
 
@@ -25,8 +24,7 @@ class Causes:
 
     def inputs_of(self, id: str) -> list[tuple[str, str]]:
         """(port, id) of what led to a message; from its header, without ports, where its step is not journalled."""
-        step = self._steps.get(id)
-        if step is not None:
+        if (step := self._steps.get(id)) is not None:
             return list(step.consumed)
         recorded = id in self._recording.messages
         return [("", cause) for cause in self._recording.recorded(id).causes] if recorded else []
@@ -34,6 +32,48 @@ class Causes:
     def last_input(self, id: str) -> str | None:
         """What the step that emitted a message had waited for: the input that was recorded last."""
         return last_recorded(self._recording, (cause for _, cause in self.inputs_of(id)))
+
+    def path_to(self, id: str) -> list[str]:
+        """The critical path from the start of a message's lineage to it: at each step the input that came last."""
+        root, path = self._root_of(id), [id]
+        while path[-1] != root and (cause := self.last_input(path[-1])) is not None and cause not in path:
+            path.append(cause)
+        return path[::-1]
+
+    def tree_of(self, id: str) -> Iterator[str]:
+        """The tree of causes as lines: depth first with a stack of its own, for chains may be longer than Python's."""
+        root = self._root_of(id)
+        seen: set[str] = set()
+        stack = [("", "", "", id)]
+        while stack:
+            lead, branch, port, current = stack.pop()
+            repeated = current in seen
+            seen.add(current)
+            note = ", as above" if repeated else self._note(current, root)
+            yield f"{lead}{branch}{f'{port}: ' if port else ''}{current}{note}"
+            if repeated or current == root:
+                continue
+            below = lead + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch]
+            inputs = self.inputs_of(current)
+            branches = ["├─ "] * (len(inputs) - 1) + ["└─ "]
+            children = [(below, mark, port, cause) for mark, (port, cause) in zip(branches, inputs, strict=False)]
+            stack.extend(reversed(children))
+
+    def _root_of(self, id: str) -> str:
+        return self._recording.messages[id].lineage if id in self._recording.messages else ""
+
+    def _note(self, id: str, root: str) -> str:
+        """What a message is, and what its step cost."""
+        step, messages = self._steps.get(id), self._recording.messages
+        kind = f"  {messages[id].type}" if id in messages else "  MISSING from the recording"
+        start = ", the lineage starts here" if id == root else ""
+        if step is None:
+            return f"{kind}{start}"
+        if not step.consumed:
+            return f"{kind}, computed {seconds(step.computed_ns)}{start or ', a start'}"
+        replica = f" by replica {step.replica}" if step.replica else ""
+        hop = f"travelled {seconds(step.travelled_ns)}, queued {seconds(step.waited_ns)}"
+        return f"{kind}, {hop}, computed {seconds(step.computed_ns)}{replica}{start}"
 
 
 def last_recorded(recording: Recording, ids: Iterable[str]) -> str | None:
@@ -51,52 +91,4 @@ def tree(recording: Recording, id: str) -> list[str]:
     causes = Causes(recording)
     if id not in recording.messages and causes.step_of(id) is None:
         raise Refused(f"{recording.path}: no message {id!r}{suggest(id, recording.messages)}")
-    root = recording.messages[id].lineage if id in recording.messages else ""
-    return list(_lines(recording, causes, id, root))
-
-
-def _lines(recording: Recording, causes: Causes, id: str, root: str) -> Iterator[str]:
-    """Depth first with a stack of its own: chains of causes may be longer than Python's."""
-    seen: set[str] = set()
-    stack = [("", "", "", id)]
-    while stack:
-        lead, branch, port, current = stack.pop()
-        repeated = current in seen
-        seen.add(current)
-        note = ", as above" if repeated else _cost(recording, causes, current, root)
-        yield f"{lead}{branch}{f'{port}: ' if port else ''}{current}{note}"
-        if repeated or current == root:
-            continue
-        below = lead + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch]
-        inputs = causes.inputs_of(current)
-        branches = ["├─ "] * (len(inputs) - 1) + ["└─ "]
-        children = [(below, mark, port, cause) for mark, (port, cause) in zip(branches, inputs, strict=False)]
-        stack.extend(reversed(children))
-
-
-def _cost(recording: Recording, causes: Causes, id: str, root: str) -> str:
-    step = causes.step_of(id)
-    kind = f"  {recording.messages[id].type}" if id in recording.messages else "  MISSING from the recording"
-    start = ", the lineage starts here" if id == root else ""
-    if step is None:
-        return f"{kind}{start}"
-    if not step.consumed:
-        return f"{kind}, computed {seconds(step.computed_ns)}{start or ', a start'}"
-    replica = f" by replica {step.replica}" if step.replica else ""
-    hop = f"travelled {seconds(step.travelled_ns)}, queued {seconds(step.waited_ns)}"
-    return f"{kind}, {hop}, computed {seconds(step.computed_ns)}{replica}{start}"
-
-
-def path_to(recording: Recording, causes: Causes, id: str) -> list[str]:
-    """The critical path from the start of a message's lineage to it: at each step the input that came last."""
-    root = recording.messages[id].lineage if id in recording.messages else ""
-    path = [id]
-    while path[-1] != root and (cause := causes.last_input(path[-1])) is not None and cause not in path:
-        path.append(cause)
-    return path[::-1]
-
-
-def edge_of(cause: str, step: Step) -> str:
-    """``publisher/port -> consumer.port`` of one message that a step consumed."""
-    port = next((port for port, id in step.consumed if id == cause), "")
-    return f"{MessageId.of(cause).topic} -> {step.stage}.{port}"
+    return list(causes.tree_of(id))

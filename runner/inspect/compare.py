@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,7 +43,10 @@ class Difference:
         return f"{self.field}: recorded {self.recorded}, replayed {self.replayed}{extent}"
 
 
-def differences(recorded: Any, replayed: Any, field: str = "", owner: str = "") -> Iterator[Difference]:
+Differences = Iterator[Difference]
+
+
+def differences(recorded: Any, replayed: Any, field: str = "", owner: str = "") -> Differences:
     """Every field that differs, in the order of declaration. Floats are compared bit by bit: NaN equals NaN."""
     if type(recorded) is not type(replayed):
         yield Difference(field, _show(recorded), _show(replayed), "types differ", owner=owner)
@@ -52,20 +55,16 @@ def differences(recorded: Any, replayed: Any, field: str = "", owner: str = "") 
             pair, place = (getattr(recorded, name), getattr(replayed, name)), f"{field}.{name}".lstrip(".")
             yield from differences(*pair, place, f"{type(recorded).__name__}.{name}")
     elif isinstance(recorded, np.ndarray):
-        yield from _array_difference(cast("NDArray[Any]", recorded), cast("NDArray[Any]", replayed), field, owner)
+        yield from _array_difference(recorded, replayed, field, owner)
     elif isinstance(recorded, dict):
-        yield from _mapping_differences(
-            cast("dict[Any, Any]", recorded), cast("dict[Any, Any]", replayed), field, owner
-        )
+        yield from _mapping_differences(recorded, replayed, field, owner)
     elif isinstance(recorded, list | tuple):
-        yield from _sequence_differences(cast("Sequence[Any]", recorded), cast("Sequence[Any]", replayed), field, owner)
+        yield from _sequence_differences(recorded, replayed, field, owner)
     elif repr(recorded) != repr(replayed):
         yield Difference(field, _show(recorded), _show(replayed), largest=_gap(recorded, replayed), owner=owner)
 
 
-def _mapping_differences(
-    recorded: dict[Any, Any], replayed: dict[Any, Any], field: str, owner: str
-) -> Iterator[Difference]:
+def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str, owner: str) -> Differences:
     if recorded.keys() != replayed.keys():
         yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ", owner=owner)
     for key in filter(replayed.__contains__, recorded):
@@ -73,16 +72,14 @@ def _mapping_differences(
         yield from differences(recorded[key], replayed[key], place, owner)
 
 
-def _sequence_differences(
-    recorded: Sequence[Any], replayed: Sequence[Any], field: str, owner: str
-) -> Iterator[Difference]:
+def _sequence_differences(recorded: Sequence[Any], replayed: Sequence[Any], field: str, owner: str) -> Differences:
     if len(recorded) != len(replayed):
         yield Difference(field, f"{len(recorded)} items", f"{len(replayed)} items", "lengths differ", owner=owner)
     for index, pair in enumerate(zip(recorded, replayed, strict=False)):
         yield from differences(*pair, f"{field}[{index}]", owner)
 
 
-def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str, owner: str) -> Iterator[Difference]:
+def _array_difference(recorded: NDArray[Any], replayed: NDArray[Any], field: str, owner: str) -> Differences:
     if recorded.dtype != replayed.dtype or recorded.shape != replayed.shape:
         yield Difference(field, _kind(recorded), _kind(replayed), "element types or shapes differ", owner=owner)
         return
@@ -119,5 +116,9 @@ def _kind(array: NDArray[Any]) -> str:
 
 
 def _show(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+    return clipped(repr(value), SHOWN)
+
+
+def clipped(text: str, length: int) -> str:
+    """A text of at most ``length`` characters, three dots in the place of the rest."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."

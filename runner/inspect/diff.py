@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from runner.inspect.compare import Difference, differences
@@ -17,23 +17,23 @@ from runner.recording.recording import Recording
 HEADER = ("lineage", "type", "version", "causes")
 """What is compared of an envelope beside its body. Logical times of devices are the wall clock's: those of two runs
 always differ."""
-IDENTICAL, DIFFERENT = 0, 1
 
 
-def diff(a: Path, b: Path, say: Callable[[str], None] = print) -> int:
-    """Says how two recordings differ; returns 1 where they do. Raises Refused where one is no recording."""
+def diff(a: Path, b: Path) -> int:
+    """Prints how two recordings differ; returns 1 where they do. Raises Refused where one is no recording."""
     first, second = Recording(a), Recording(b)
     for recording in (first, second):
-        say(f"{recording.path}: {len(recording.messages)} messages, {recording.verdict}")
+        print(f"{recording.path}: {len(recording.messages)} messages, {recording.verdict}")
     for line in _origins(first, second):
-        say(line)
+        print(line)
     summary = Summary()
     found = list(_found(first, second, summary))
-    say(f"first difference: {found[0]}" if found else _equal(first))
+    equal = f"no difference: {len(first.messages)} messages are equal"
+    print(f"first difference: {found[0]}" if found else equal)
     for block in (_counts(first, second), summary.lines()):
-        for line in ["", *block] if block else []:
-            say(line)
-    return DIFFERENT if found else IDENTICAL
+        if block:
+            print("", *block, sep="\n")
+    return int(bool(found))
 
 
 def _found(first: Recording, second: Recording, summary: Summary) -> Iterator[str]:
@@ -65,15 +65,12 @@ def _words(difference: Difference) -> str:
     return f"{difference.field}: {difference.recorded} and {difference.replayed}{extent}"
 
 
-def _equal(recording: Recording) -> str:
-    return f"no difference: {len(recording.messages)} messages are equal"
-
-
 def _counts(first: Recording, second: Recording) -> list[str]:
     """Topics of which one recording holds more messages than the other."""
-    ids = (first.messages.keys() - second.messages.keys(), second.messages.keys() - first.messages.keys())
-    counts = [Counter(MessageId.of(id).topic for id in side) for side in ids]
-    rows = [(topic, *(str(count[topic]) for count in counts)) for topic in sorted({*counts[0], *counts[1]})]
+    only_first = Counter(message.topic for id, message in first.messages.items() if id not in second.messages)
+    only_second = Counter(message.topic for id, message in second.messages.items() if id not in first.messages)
+    topics = sorted({*only_first, *only_second})
+    rows = [(topic, str(only_first[topic]), str(only_second[topic])) for topic in topics]
     return table(("topic", "only in A", "only in B"), rows)
 
 

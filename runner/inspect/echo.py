@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -33,16 +33,15 @@ def lines_of(payload: bytes | memoryview) -> Iterator[str]:
 def _indented(value: Any, indent: str) -> Iterator[str]:
     match value:
         case dict():
-            for key, inner in cast("dict[Any, Any]", value).items():
+            for key, inner in value.items():
                 yield from _entry(f"{indent}{key}:", inner, indent)
         case list():
-            items = cast("list[Any]", value)
-            for inner in items[:SHOWN_ITEMS]:
+            for inner in value[:SHOWN_ITEMS]:
                 first, *more = _item(inner, f"{indent}  ")
                 yield f"{indent}- {first.lstrip()}"
                 yield from more
-            if len(items) > SHOWN_ITEMS:
-                yield f"{indent}... and {len(items) - SHOWN_ITEMS} more"
+            if len(value) > SHOWN_ITEMS:
+                yield f"{indent}... and {len(value) - SHOWN_ITEMS} more"
         case _:
             yield f"{indent}{_scalar(value)}"
 
@@ -67,20 +66,19 @@ def _is_nested(value: Any) -> bool:
     """What does not fit on one line: short lists of plain values do, and arrays."""
     if not isinstance(value, dict | list) or not value:
         return False
-    items = cast("list[Any]", value)
-    inner = any(isinstance(item, dict | list | np.ndarray) or "\n" in str(item) for item in items)
-    return isinstance(value, dict) or inner or len(items) > SHOWN_ELEMENTS
+    inner = any(isinstance(item, dict | list | np.ndarray) or "\n" in str(item) for item in value)
+    return isinstance(value, dict) or inner or len(value) > SHOWN_ELEMENTS
 
 
 def _scalar(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        return array_text(cast("np.ndarray[Any, Any]", value))
+        return array_text(value)
     if isinstance(value, bytes):
         return f"{byte_count(len(value))} of bytes"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return f"[{', '.join(map(_scalar, cast('list[Any]', value)))}]"
+        return f"[{', '.join(map(_scalar, value))}]"
     text = str(value)
     return f"{text[:SHOWN_CHARACTERS]}{'...' if len(text) > SHOWN_CHARACTERS else ''}"
 

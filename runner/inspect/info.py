@@ -21,18 +21,23 @@ RESTARTED = f"{SUPERVISOR}/{port_name(Restarted)}"
 def describe(path: Path) -> str:
     """The whole description; raises Refused with one line where the file is no recording."""
     recording = Recording(path)
-    blocks = (_origin(recording), _topics(recording), _stage_times(recording), _complaints(recording))
+    times = StageTimes()
+    for step in recording.steps:
+        times.note(step)
+    blocks = (_origin(recording), _topics(recording), times.lines(), _complaints(recording))
     return "\n\n".join("\n".join(block) for block in map(list, blocks) if block)
 
 
 def _origin(recording: Recording) -> Iterator[str]:
     run, machine = recording.run, recording.aspect("machine", dict[str, str]())
     settings = recording.aspect("settings", list[str]())
+    times = [message.log_time_ns for message in recording.messages.values()]
+    restarts = sum(message.topic == RESTARTED for message in recording.messages.values())
+    counts = f"{len(times)} messages, {restarts} restart{'' if restarts == 1 else 's'}"
     yield f"{recording.path}: {recording.verdict}"
     yield f"graph     {run.get('name')} (seed {run.get('seed')}{''.join(f', --set {text}' for text in settings)})"
-    yield f"started   {run.get('started')}, lasted {seconds(_duration_ns(recording))}"
-    size = byte_count(recording.path.stat().st_size)
-    yield f"size      {size}, {len(recording.messages)} messages, {_restarts(recording)}"
+    yield f"started   {run.get('started')}, lasted {seconds(max(times, default=0) - min(times, default=0))}"
+    yield f"size      {byte_count(recording.path.stat().st_size)}, {counts}"
     yield f"revision  {run.get('revision') or 'unknown'}"
     if "runner" in run:
         yield f"runner    {run['runner']}"
@@ -52,15 +57,14 @@ def _topics(recording: Recording) -> list[str]:
     by_topic: dict[str, list[Located]] = defaultdict(list)
     for message in recording.messages.values():
         by_topic[message.topic].append(message)
-    rows = [_topic_row(topic, messages) for topic, messages in sorted(by_topic.items())]
+    rows: list[Cells] = []
+    for topic, messages in sorted(by_topic.items()):
+        times = [message.log_time_ns for message in messages]
+        span = (max(times) - min(times)) * 1e-9
+        rate = f"{(len(messages) - 1) / span:.2f}" if span > 0 else "-"
+        size = byte_count(sum(message.size for message in messages))
+        rows.append((topic, messages[0].type, str(len(messages)), size, rate))
     return table(("topic", "type", "count", "bytes", "per second"), rows)
-
-
-def _topic_row(topic: str, messages: list[Located]) -> Cells:
-    times = [message.log_time_ns for message in messages]
-    span = (max(times) - min(times)) * 1e-9
-    rate = f"{(len(messages) - 1) / span:.2f}" if span > 0 else "-"
-    return topic, messages[0].type, str(len(messages)), byte_count(sum(message.size for message in messages)), rate
 
 
 class Durations:
@@ -146,13 +150,6 @@ class _Times:
         )
 
 
-def _stage_times(recording: Recording) -> list[str]:
-    times = StageTimes()
-    for step in recording.steps:
-        times.note(step)
-    return times.lines()
-
-
 def _complaints(recording: Recording) -> Iterator[str]:
     yield from (f"damage at {damage}" for damage in recording.damage)
     yield from (f"missing {id}" for id in recording.verdict.missing)
@@ -163,16 +160,6 @@ def _complaints(recording: Recording) -> Iterator[str]:
     for line in recording.log:
         if line.level in ("warning", "error"):
             yield f"{line.level} of {line.stage}[{line.replica}]: {line.text}"
-
-
-def _restarts(recording: Recording) -> str:
-    count = sum(message.topic == RESTARTED for message in recording.messages.values())
-    return f"{count} restart{'' if count == 1 else 's'}"
-
-
-def _duration_ns(recording: Recording) -> int:
-    times = [message.log_time_ns for message in recording.messages.values()]
-    return max(times) - min(times) if times else 0
 
 
 def table(titles: Cells, rows: Iterable[Cells]) -> list[str]:

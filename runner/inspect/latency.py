@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
-from runner.inspect.causes import Causes, edge_of, last_recorded, path_to
+from runner.inspect.causes import Causes, last_recorded
 from runner.inspect.info import Cells, seconds, table
 from runner.message.codec import Step
-from runner.recording.recording import Recording
+from runner.message.ids import MessageId
+from runner.recording.recording import Located, Recording
 
 PATHS = 20
 """Critical paths that are shown, the longest first."""
@@ -38,9 +40,9 @@ def latency(path: Path) -> list[str]:
     paths = critical_paths(recording, causes)
     blocks = (
         [f"{path}: {recording.verdict}"],
-        _edges(recording, causes),
+        _edges(recording),
         _stages(recording.steps),
-        _path_table(paths),
+        _paths(paths[:PATHS]),
         [_path_line(found) for found in paths[:PATHS]],
     )
     return [line for block in blocks if block for line in (*block, "")][:-1]
@@ -48,36 +50,40 @@ def latency(path: Path) -> list[str]:
 
 def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
     """One per lineage that a step followed on, the longest first."""
-    lineages: dict[str, list[str]] = defaultdict(list)
+    lineages: dict[str, list[Located]] = defaultdict(list)
     for message in recording.messages.values():
-        lineages[message.lineage].append(message.id)
-    paths = [_critical_path(recording, causes, lineage, ids) for lineage, ids in lineages.items()]
-    return sorted((path for path in paths if path.hops), key=lambda path: -path.elapsed_ns)
-
-
-def _critical_path(recording: Recording, causes: Causes, lineage: str, ids: Sequence[str]) -> CriticalPath:
-    received = {id: recording.messages[id].log_time_ns for id in ids}
-    last = max(ids, key=lambda id: received[id])
-    steps = (causes.step_of(id) for id in path_to(recording, causes, last)[1:])
-    hops = tuple(step for step in steps if step is not None)
-    return CriticalPath(lineage, last, received[last] - min(received.values()), hops)
+        lineages[message.lineage].append(message)
+    paths: list[CriticalPath] = []
+    received = attrgetter("log_time_ns")
+    for lineage, messages in lineages.items():
+        first, last = min(messages, key=received), max(messages, key=received)
+        steps = (causes.step_of(id) for id in causes.path_to(last.id)[1:])
+        if hops := tuple(step for step in steps if step is not None):
+            paths.append(CriticalPath(lineage, last.id, last.log_time_ns - first.log_time_ns, hops))
+    return sorted(paths, key=lambda path: -path.elapsed_ns)
 
 
 # ------------------------------------------------------------------------------------ tables
 
 
-def _edges(recording: Recording, causes: Causes) -> list[str]:
+def _edges(recording: Recording) -> list[str]:
     """A step's waiting is its last input's: what waits for a partner at a join is not late."""
-    travelled: dict[str, list[int]] = defaultdict(list)
-    queued: dict[str, list[int]] = defaultdict(list)
+    by_edge: dict[str, list[Step]] = defaultdict(list)
     for step in recording.steps:
         last = last_recorded(recording, (id for _, id in step.consumed))
         if last is not None:
-            edge = edge_of(last, step)
-            travelled[edge].append(step.travelled_ns)
-            queued[edge].append(step.waited_ns)
-    rows = ((edge, str(len(travelled[edge])), *_spread(travelled[edge]), *_spread(queued[edge])) for edge in travelled)
-    return table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), sorted(rows))
+            port = next(port for port, id in step.consumed if id == last)
+            by_edge[f"{MessageId.of(last).topic} -> {step.stage}.{port}"].append(step)
+    rows = [
+        (
+            edge,
+            str(len(steps)),
+            *_spread([step.travelled_ns for step in steps]),
+            *_spread([step.waited_ns for step in steps]),
+        )
+        for edge, steps in sorted(by_edge.items())
+    ]
+    return table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), rows)
 
 
 def _stages(steps: Iterable[Step]) -> list[str]:
@@ -92,27 +98,21 @@ def _spread(times: Sequence[int]) -> Cells:
     return [seconds(float(value)) for value in np.percentile(times, (50, 99))]
 
 
-def _path_table(paths: Sequence[CriticalPath]) -> list[str]:
-    rows = [_path_row(path) for path in paths[:PATHS]]
+def _paths(paths: Iterable[CriticalPath]) -> list[str]:
+    rows: list[Cells] = []
+    for path in paths:
+        sums = [sum(getattr(hop, name) for hop in path.hops) for name in ("travelled_ns", "waited_ns", "computed_ns")]
+        rows.append((path.lineage, str(len(path.hops)), *map(seconds, (path.elapsed_ns, *sums)), path.last))
     return table(("critical path of", "hops", "elapsed", "travel", "queue", "compute", "up to"), rows)
-
-
-def _path_row(path: CriticalPath) -> Cells:
-    sums = (sum(getattr(hop, name) for hop in path.hops) for name in ("travelled_ns", "waited_ns", "computed_ns"))
-    return path.lineage, str(len(path.hops)), seconds(path.elapsed_ns), *map(seconds, sums), path.last
 
 
 def _path_line(path: CriticalPath) -> str:
     """The costliest hops in the order of the path; further visits of a stage are added to its first."""
-    by_stage: dict[str, int] = defaultdict(int)
+    by_stage = Counter[str]()
     for hop in path.hops:
         by_stage[hop.stage] += hop.travelled_ns + hop.waited_ns + hop.computed_ns
-    costly = set(sorted(by_stage, key=lambda stage: -by_stage[stage])[:HOPS])
-    return f"{path.lineage}: " + ", ".join(_named(by_stage, costly))
-
-
-def _named(by_stage: dict[str, int], costly: set[str]) -> Iterator[str]:
-    yield from (f"{stage} {seconds(total)}" for stage, total in by_stage.items() if stage in costly)
-    rest = sum(total for stage, total in by_stage.items() if stage not in costly)
-    if rest:
-        yield f"others {seconds(rest)}"
+    costly = {stage for stage, _ in by_stage.most_common(HOPS)}
+    named = [f"{stage} {seconds(total)}" for stage, total in by_stage.items() if stage in costly]
+    if rest := sum(total for stage, total in by_stage.items() if stage not in costly):
+        named.append(f"others {seconds(rest)}")
+    return f"{path.lineage}: {', '.join(named)}"

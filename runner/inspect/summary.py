@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable
 
 import msgspec
 
 from runner.inspect.compare import Difference
-from runner.inspect.info import table
+from runner.inspect.info import Cells, table
 
 
 class FieldChange(msgspec.Struct):
@@ -35,10 +35,11 @@ class Summary:
     """Collects differences message by message; what several processes collected is merged."""
 
     def __init__(self, changes: Iterable[FieldChange] = ()) -> None:
-        self._compared: dict[str, int] = defaultdict(int)
-        self._changed: dict[str, int] = defaultdict(int)
+        """``changes`` are what other summaries found."""
+        self._compared = Counter[str]()
         self._fields: dict[tuple[str, str], FieldChange] = {}
-        self.merge(changes)
+        for change in changes:
+            self._field(change.topic, change.field).add(change.messages, change.largest, change.first)
 
     def add(self, topic: str, id: str, differences: Iterable[Difference]) -> bool:
         """Enters one compared message; returns whether it differs."""
@@ -49,13 +50,7 @@ class Summary:
             largest = max((gap for gap in gaps if gap is not None), default=None)
             self._field(topic, field).add(1, largest, id)
         self._compared[topic] += 1
-        self._changed[topic] += bool(found)
         return bool(found)
-
-    def merge(self, changes: Iterable[FieldChange]) -> None:
-        """Enters what another summary found."""
-        for change in changes:
-            self._field(change.topic, change.field).add(change.messages, change.largest, change.first)
 
     @property
     def changes(self) -> list[FieldChange]:
@@ -64,18 +59,13 @@ class Summary:
 
     def lines(self) -> list[str]:
         """A table of all fields that differ; nothing where none does."""
-        return table(("topic", "field", "messages", "largest", "first"), self._rows())
-
-    def _rows(self) -> Iterator[tuple[str, ...]]:
+        rows: list[Cells] = []
         for change in self.changes:
-            compared = self._compared.get(change.topic)
+            compared = self._compared[change.topic]
             messages = f"{change.messages} of {compared}" if compared else str(change.messages)
-            yield change.topic, change.field, messages, magnitude(change.largest), change.first
+            largest = "-" if change.largest is None else f"{change.largest:.3g}"
+            rows.append((change.topic, change.field, messages, largest, change.first))
+        return table(("topic", "field", "messages", "largest", "first"), rows)
 
     def _field(self, topic: str, field: str) -> FieldChange:
         return self._fields.setdefault((topic, field), FieldChange(topic, field))
-
-
-def magnitude(largest: float | None) -> str:
-    """A largest difference for people to read; a dash where there is none in numbers."""
-    return "-" if largest is None else f"{largest:.3g}"

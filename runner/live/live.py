@@ -25,12 +25,8 @@ ANSWER_SECONDS = 10.0
 POLL_SECONDS = 0.1
 RESTART_SECONDS = 300.0
 """Bringing a stage back takes as long as its models take to load."""
-
-
 WINDOW_NS = 10_000_000_000
 """Rates are taken over the last ten seconds."""
-
-
 BACKLOG = 1000
 """Messages that a slow terminal may fall behind; the rest is left out."""
 
@@ -42,11 +38,6 @@ class Header(NamedTuple):
     arrived_ns: int
     size: int
     """Bytes of the envelope."""
-
-    @staticmethod
-    def of(packet: Packet) -> Header:
-        """Those of a message."""
-        return Header(packet.sent_ns, packet.arrived_ns, len(packet.payload))
 
 
 class Backlog:
@@ -139,7 +130,8 @@ class Live:
         backlog, window = Backlog(self.bus, f"m/{self._known(topic)}"), deque[Header]()
         due = time.monotonic() + 1.0
         while is_alive(self.entry):
-            window.extend(map(Header.of, backlog.take(POLL_SECONDS)))
+            packets = backlog.take(POLL_SECONDS)
+            window += (Header(packet.sent_ns, packet.arrived_ns, len(packet.payload)) for packet in packets)
             if time.monotonic() >= due:
                 due += 1.0
                 while window and window[0].arrived_ns < time.monotonic_ns() - WINDOW_NS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -56,28 +57,23 @@ def _process_row(process: ProcessStatus) -> Sequence[str]:
 
 def topics_text(status: RunStatus) -> str:
     """Every topic with its type, what has flowed and what flows now."""
-    flows: dict[str, list[Flow]] = {}
+    flows: dict[str, list[Flow]] = defaultdict(list)
     for process in status.processes:
         for port, flow in process.sent.items():
-            flows.setdefault(f"{process.stage}/{port}", []).append(flow)
-    rows = [
-        (
-            topic.topic,
-            topic.type,
-            str(status.published.get(topic.topic, 0) + sum(flow.messages for flow in flows.get(topic.topic, ()))),
-            f"{sum(flow.per_second for flow in flows.get(topic.topic, ())):.1f}",
-            byte_count(sum(flow.bytes_per_second for flow in flows.get(topic.topic, ()))),
-            ", ".join(topic.consumers) or "nobody",
-        )
-        for topic in status.topics
-    ]
+            flows[f"{process.stage}/{port}"].append(flow)
+    rows: list[Sequence[str]] = []
+    for topic in status.topics:
+        own = flows[topic.topic]
+        sent = status.published.get(topic.topic, 0) + sum(flow.messages for flow in own)
+        rate, size = sum(flow.per_second for flow in own), sum(flow.bytes_per_second for flow in own)
+        consumers = ", ".join(topic.consumers) or "nobody"
+        rows.append((topic.topic, topic.type, str(sent), f"{rate:.1f}", byte_count(size), consumers))
     return "\n".join(table(("topic", "type", "sent", "per second", "bytes/s", "goes to"), rows))
 
 
 def from_here(path: str) -> str:
     """A path as a user in this folder would type it."""
-    here = f"{Path.cwd()}{os.sep}"
-    return path.removeprefix(here)
+    return path.removeprefix(f"{Path.cwd()}{os.sep}")
 
 
 # ------------------------------------------------------------------------------------------ rates
@@ -123,7 +119,8 @@ def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> 
             began = began or line.time_ns
             name = f"{line.stage}.{line.replica}" if line.replica else line.stage
             terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    if stage is not None and stage not in seen and not _has_output(recording, stage):
+    printed = (recording.with_suffix("") / "log").glob(f"{stage}-*.txt")
+    if stage is not None and stage not in seen and not any(printed):
         raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
 
 
@@ -134,10 +131,6 @@ def _began(recording: Path) -> int:
         return int(time.mktime(time.strptime(stamp, "%Y%m%d-%H%M%S")) * 1e9)
     except ValueError:
         return 0
-
-
-def _has_output(recording: Path, stage: str) -> bool:
-    return any((recording.with_suffix("") / "log").glob(f"{stage}-*.txt"))
 
 
 def commands_text(commands: Sequence[CommandType], stage: str | None) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -19,7 +19,7 @@ import msgspec
 
 from runner.contract import Refused
 from runner.graph.graph import Graph, Node
-from runner.message.codec import CodecError, Envelope, Step
+from runner.message.codec import CodecError, Envelope
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Executor, receive, step_time
@@ -28,6 +28,8 @@ from runner.replay.workers import Worker
 
 AHEAD = 16
 """Recorded messages that are delivered while steps run; more would only wait in memory."""
+END = b""
+"""A request that is the last: the stage is closed."""
 Key = tuple[str, str, str, int]
 """A step by what it is, whatever it consumes: stage, handler, lineage, and how many such steps come before it."""
 
@@ -57,7 +59,7 @@ def serve(node: Node, seed: int, directory: Path, connection: Connection) -> Non
         return
     executor = Executor(node, stage, seed=seed, directory=directory, log=lambda *_: None)
     connection.send_bytes(msgspec.msgpack.encode(Answer()))
-    while request := connection.recv_bytes():
+    while (request := connection.recv_bytes()) != END:
         answer = _answer(node, executor, msgspec.msgpack.decode(request, type=Request))
         connection.send_bytes(msgspec.msgpack.encode(answer))
     stage.close()
@@ -80,9 +82,9 @@ class _Stage:
 
     node: Node
     inbox: Inbox
-    idle: list[Worker]
     expected: deque[Key]
     """The recorded steps that are still to come, in order."""
+    idle: list[Worker] = field(default_factory=list[Worker])
     ready: dict[Key, Ready] = field(default_factory=dict[Key, Ready])
     counts: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
     """Steps that became ready, by handler and lineage."""
@@ -123,7 +125,7 @@ class PartialReplay:
         self._workers = workers
         self._ranks, self._times = _journal(recording)
         self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
-        self._frozen = _Frozen(recording, names)
+        self.frozen = Frozen(recording, names)
         self._ahead = 0
         self._running: dict[Connection, tuple[_Stage, Key, Worker]] = {}
         self._processes: list[Worker] = []
@@ -133,22 +135,17 @@ class PartialReplay:
         """Executes until nothing is left to do, and leaves no process behind."""
         try:
             for child in self._processes:
-                self._await_construction(child)
-            self._start_handlers()
+                if error := _answer_of(child, child.log.stem).error:
+                    raise Refused(error)
             while self._advance():
                 pass
+            for child in self._processes:
+                child.send(END)
+            for child in self._processes:
+                child.end()
         finally:
             for child in self._processes:
                 child.kill()
-
-    @property
-    def frozen(self) -> dict[str, Envelope]:
-        """The recorded messages that took part, by id."""
-        return self._frozen.released
-
-    def never_came(self) -> list[str]:
-        """Ids of recorded messages of devices that answered what is not asked any more."""
-        return self._frozen.blocked()
 
     # ------------------------------------------------------------------------------------ processes
 
@@ -157,8 +154,15 @@ class PartialReplay:
         files = folder / node.name
         files.mkdir()
         node.prepare()
-        idle = [self._fork(node, files, folder) for _ in range(self._workers if node.replicated else 1)]
-        return _Stage(node, Inbox(node), idle, deque(self._expected(node)))
+        stage = _Stage(node, Inbox(node), deque(self._expected(node)))
+        for _ in range(self._workers if node.replicated else 1):
+            log = folder / f"{node.name}-{len(self._processes)}.txt"
+            stage.idle.append(Worker(lambda connection: serve(node, self._graph.seed, files, connection), log))
+            self._processes.append(stage.idle[-1])
+        for handler in node.type.handlers:
+            if not handler.inputs:
+                stage.add(Ready(handler, ()))
+        return stage
 
     def _expected(self, node: Node) -> list[Key]:
         """The recorded steps of a stage, in order: the journal's, or where replicas shared them, that of the looks."""
@@ -168,27 +172,7 @@ class PartialReplay:
         place = {handler.name: index for index, handler in enumerate(node.type.handlers)}
         return sorted(keys, key=lambda key: (MessageId.of(key[2]), place.get(key[1], len(place)), key[3]))
 
-    def _fork(self, node: Node, files: Path, folder: Path) -> Worker:
-        log = folder / f"{node.name}-{len(self._processes)}.txt"
-        child = Worker(lambda connection: serve(node, self._graph.seed, files, connection), log)
-        self._processes.append(child)
-        return child
-
-    def _await_construction(self, child: Worker) -> None:
-        try:
-            error = msgspec.msgpack.decode(child.receive(), type=Answer).error
-        except EOFError:
-            error = f"{child.log.stem}: {child.end()}"
-        if error:
-            raise Refused(error)
-
     # ------------------------------------------------------------------------------------ scheduling
-
-    def _start_handlers(self) -> None:
-        for stage in self._stages.values():
-            for handler in stage.node.type.handlers:
-                if not handler.inputs:
-                    stage.add(Ready(handler, ()))
 
     def _advance(self) -> bool:
         """Takes one action; False where there is none left."""
@@ -198,7 +182,9 @@ class PartialReplay:
                 if key is not None:
                     self._dispatch(stage, key)
                     return True
-            if self._ahead < AHEAD and self._release():
+            if self._ahead < AHEAD and (sealed := self.frozen.next()) is not None:
+                self._ahead += bool(self._running)
+                self._deliver(sealed)
                 return True
         if self._running:
             self._collect()
@@ -221,35 +207,24 @@ class PartialReplay:
         ready, child = stage.take(key)
         inputs = tuple((arrival.port.name, arrival.envelope) for arrival in ready.arrivals)
         time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
-        child.connection.send_bytes(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
+        child.send(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
         self._running[child.connection] = (stage, key, child)
 
     def _collect(self) -> None:
-        connection = cast("Connection", wait(list(self._running))[0])
-        stage, key, child = self._running.pop(connection)
-        try:
-            answer = msgspec.msgpack.decode(child.receive(), type=Answer)
-        except EOFError:
-            raise Refused(f"{_step_name(key)}: {child.end()}") from None
+        stage, key, child = self._running.pop(cast("Connection", wait(list(self._running))[0]))
+        name = f"{key[0]}.{key[1]} of {key[2] or 'the start'}"
+        answer = _answer_of(child, name)
         self._ahead = 0
         stage.idle.append(child)
         if answer.error:
-            self.errors.append(f"{_step_name(key)}: {answer.error}")
+            self.errors.append(f"{name}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
-            self._frozen.came(sealed.id)
-            self._deliver(sealed, recorded=False)
+            self.frozen.came(sealed.id)
+            self._deliver(sealed)
 
-    def _release(self) -> bool:
-        """Delivers the next message that stays as recorded."""
-        sealed = self._frozen.next()
-        if sealed is not None:
-            self._ahead += bool(self._running)
-            self._deliver(sealed, recorded=True)
-        return sealed is not None
-
-    def _deliver(self, sealed: Envelope, *, recorded: bool) -> None:
-        id = MessageId.of(sealed.id)
+    def _deliver(self, sealed: Envelope) -> None:
+        id, recorded = MessageId.of(sealed.id), sealed.id in self.frozen.released
         for route in self._graph.routes(id.stage):
             stage = self._stages.get(route.consumer)
             if route.output != id.port or stage is None:
@@ -267,7 +242,15 @@ class PartialReplay:
             stage.add(ready)
 
 
-class _Frozen:
+def _answer_of(child: Worker, what: str) -> Answer:
+    """What a process sends next; raises Refused where it has ended instead, naming ``what`` it was to do."""
+    try:
+        return msgspec.msgpack.decode(child.connection.recv_bytes(), type=Answer)
+    except (EOFError, ConnectionResetError):
+        raise Refused(f"{what}: {child.end()}") from None
+
+
+class Frozen:
     """The messages that stay as recorded: each comes once all that it answers has come."""
 
     def __init__(self, recording: Recording, names: Collection[str]) -> None:
@@ -286,8 +269,8 @@ class _Frozen:
         while self._free:
             _, id = heapq.heappop(self._free)
             sealed = self._recording.envelope(id)
-            cause = next(self._lacking(sealed), None)
-            if cause is None:
+            lacking = (one for one in sealed.causes if one in self._positions and one not in self._came)
+            if (cause := next(lacking, None)) is None:
                 self.released[id] = sealed
                 self.came(id)
                 return sealed
@@ -304,9 +287,6 @@ class _Frozen:
         """What has not come, in order."""
         return sorted((id for ids in self._waiting.values() for id in ids), key=self._positions.__getitem__)
 
-    def _lacking(self, sealed: Envelope) -> Iterator[str]:
-        return (cause for cause in sealed.causes if cause in self._positions and cause not in self._came)
-
 
 def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
     """The order and the logical time of every step that was done."""
@@ -316,18 +296,9 @@ def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
     ranks: dict[Key, int] = {}
     times: dict[Key, int] = {}
     for step in done:
-        place = (step.stage, step.handler, _lineage(recording, step))
+        known = (recording.messages[id].lineage for _, id in step.consumed if id in recording.messages)
+        place = (step.stage, step.handler, next(known, ""))
         key = (*place, counts[place])
         counts[place] += 1
         ranks[key], times[key] = len(ranks), step.time_ns
     return ranks, times
-
-
-def _lineage(recording: Recording, step: Step) -> str:
-    recorded = (id for _, id in step.consumed if id in recording.messages)
-    return next((recording.envelope(id).lineage for id in recorded), "")
-
-
-def _step_name(key: Key) -> str:
-    stage, handler, lineage, _ = key
-    return f"{stage}.{handler} of {lineage or 'the start'}"

@@ -11,11 +11,13 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import fields, is_dataclass
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
@@ -28,10 +30,8 @@ from runner.inspect.summary import Summary
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording, replicated
 from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
-from runner.replay.tolerances import Origin
-from runner.replay.workers import Job, run_each
-
-Say = Callable[[str], None]
+from runner.replay.tolerances import compare_origin
+from runner.replay.workers import run_each
 
 
 def change(recording: Recording, assignments: Sequence[str] = (), swaps: Sequence[str] = ()) -> Graph:
@@ -49,7 +49,7 @@ def _swap(document: Document, swap: str) -> None:
     stage, equals, reference = swap.partition("=")
     if not equals or ":" not in reference:
         raise Refused(f"--swap {swap}: expected stage=module:Class, for example --swap ranker=mine:Ranker")
-    stages = cast("dict[str, dict[str, Any]]", document.values["stages"])
+    stages = document.values["stages"]
     if stage not in stages:
         raise Refused(f"--swap {swap}: no stage {stage!r}{suggest(stage, stages)}")
     config = getattr(load_class(reference, f"--swap {swap}"), "Config", None)
@@ -58,8 +58,8 @@ def _swap(document: Document, swap: str) -> None:
     stages[stage] |= {"stage": reference, "config": kept}
 
 
-def plan(path: Path, say: Say) -> int:
-    """Says what a replay would execute."""
+def plan(path: Path) -> list[str]:
+    """What a replay would execute, as lines."""
     recording = Recording(path)
     recording.require_messages()
     rows: list[tuple[str, ...]] = []
@@ -67,67 +67,60 @@ def plan(path: Path, say: Say) -> int:
         steps = [step for step in recording.steps if step.stage == name]
         treatment = "device: its messages are taken from the recording" if node.type.cls.device else "executed again"
         rows.append((name, treatment, str(len(steps)), seconds(sum(step.computed_ns for step in steps))))
-    for line in (f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)):
-        say(line)
-    return 0
+    return [f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)]
 
 
-def verify(path: Path, assignments: Sequence[str], *, workers: int | None, say: Say) -> int:
+def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> int:
     """Executes everything again in ``workers`` processes at a time (None: one a core) and compares every byte.
 
-    Returns 0 where every message is identical, or where this machine is another and every message within the
-    graph's tolerances; else 1. Raises Refused where the file is no recording.
+    Prints what comes of it. Returns 0 where every message is identical, or where this machine is another and every
+    message within the graph's tolerances; else 1. Raises Refused where the file is no recording.
     """
     began = time.perf_counter()
     recording = Recording(path)
     recording.require_messages()
-    origin = Origin(recording)
-    for line in origin.lines():
-        say(line)
-    say(f"{path}: {recording.verdict}")
+    same, changes = compare_origin(recording)
+    print(*changes, f"{path}: {recording.verdict}", sep="\n")
     values, tolerances = recording.graph, dict[str, Tolerance]()
-    if assignments or not origin.same:  # else it was checked when it was recorded: classes are imported as they come
+    if assignments or not same:  # else it was checked when it was recorded: classes are imported as they come
         graph = change(recording, assignments)
-        values, tolerances = json.loads(graph_to_json(graph)), {} if origin.same else _tolerances(graph)
-    verification = _Verification(recording, values, tolerances, say)
-    return verification.conclude(verification.run(workers or len(os.sched_getaffinity(0))), began)
-
-
-def _tolerances(graph: Graph) -> Tolerances:
-    return load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
+        values = json.loads(graph_to_json(graph))
+        if not same:
+            tolerances = load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
+    results: dict[Task, Result] = {}
+    for task, result in _Verification(recording, values, tolerances).results(workers or len(os.sched_getaffinity(0))):
+        print(f"{task}: {result}")
+        results[task] = result
+    found = Summary(change for result in results.values() for change in result.changes)
+    code, verdict = _verdict(recording, values, results)
+    print(*found.lines(), _cost(recording, results, time.perf_counter() - began), verdict, sep="\n")
+    return code
 
 
 class _Verification:
     """One replay of everything."""
 
-    def __init__(self, recording: Recording, graph: dict[str, Any], tolerances: Tolerances, say: Say) -> None:
+    def __init__(self, recording: Recording, graph: dict[str, Any], tolerances: Tolerances) -> None:
         self._recording = recording
         self._graph = graph
         self._tolerances = tolerances
-        self._say = say
-        self._executed: list[str] = []
 
-    def run(self, workers: int) -> list[Result]:
+    def results(self, workers: int) -> Iterator[tuple[Task, Result]]:
         """Executes every task and says how each ended."""
-        results: list[Result] = []
         with tempfile.TemporaryDirectory() as folder:
             jobs = self._jobs(workers, Path(folder))
             for task, answer in run_each(jobs, workers=workers, folder=Path(folder)):
                 failed = isinstance(answer, str)
-                result = Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
-                self._say(f"{task}: {result}")
-                results.append(result)
-        return results
+                yield task, Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
 
-    def _jobs(self, workers: int, folder: Path) -> Iterator[Job[Task]]:
+    def _jobs(self, workers: int, folder: Path) -> Iterator[tuple[Task, Callable[[], bytes]]]:
         """Every task, longest stages first, so that the workers end together; each is imported when it is drawn."""
         for stage in _by_cost(self._recording):
             node = node_from_entry(stage, self._graph["stages"][stage])
             if not node.type.cls.device:
-                self._executed.append(stage)
                 node.prepare()
                 for task in tasks_of(self._recording, node, workers):
-                    yield Job(task, lambda node=node, task=task: self._work(node, task, folder))
+                    yield task, partial(self._work, node, task, folder)
 
     def _work(self, node: Node, task: Task, folder: Path) -> bytes:
         """Executes one task; runs in the task's own process."""
@@ -147,40 +140,35 @@ class _Verification:
         again.stage.close()
         return comparison.result(again.seconds, startup)
 
-    def conclude(self, results: Sequence[Result], began: float) -> int:
-        """The verdict, what differs by field, and the exit status."""
-        wall = time.perf_counter() - began
-        for line in Summary(change for result in results for change in result.changes).lines():
-            self._say(line)
-        recorded = sum(step.computed_ns for step in self._recording.steps if step.stage in self._executed)
-        computed, startup = sum(result.seconds for result in results), sum(result.startup for result in results)
-        self._say(
-            f"replayed in {wall:.1f} s: handlers took {computed:.1f} s of processor time (when recorded "
-            f"{recorded * 1e-9:.1f} s), constructing the stages {startup:.1f} s"
-        )
-        return self._verdict(results)
 
-    def _verdict(self, results: Sequence[Result]) -> int:
-        stages = f"of {len(self._executed)} stages"
-        compared, within = sum(result.messages for result in results), sum(result.within for result in results)
-        found = sorted((result.first for result in results if result.first), key=lambda found: found.position)
-        verdict = self._recording.verdict
-        if found:
-            self._say(f"DIVERGED first at {found[0]}")
-            return 1
-        if any(result.failure for result in results) or not verdict.complete:
-            expected = sum(MessageId.of(id).stage in self._executed for id in self._recording.messages)
-            none = "none differs" if not within else f"{within} within tolerances, none beyond"
-            self._say(f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {verdict}")
-            return 1
-        if within:
-            table = self._graph.get("tolerances")
-            self._say(
-                f"WITHIN TOLERANCES: {within} of {compared} messages {stages} differ, none by more than {table} allows"
-            )
-        else:
-            self._say(f"IDENTICAL: {compared} messages {stages}")
-        return 0
+def _cost(recording: Recording, results: Mapping[Task, Result], wall: float) -> str:
+    executed = {task.stage for task in results}
+    recorded = sum(step.computed_ns for step in recording.steps if step.stage in executed)
+    computed = sum(result.seconds for result in results.values())
+    startup = sum(result.startup for result in results.values())
+    return (
+        f"replayed in {wall:.1f} s: handlers took {computed:.1f} s of processor time (when recorded "
+        f"{recorded * 1e-9:.1f} s), constructing the stages {startup:.1f} s"
+    )
+
+
+def _verdict(recording: Recording, graph: Mapping[str, Any], results: Mapping[Task, Result]) -> tuple[int, str]:
+    """The exit status and what it means."""
+    executed = {task.stage for task in results}
+    compared = sum(result.messages for result in results.values())
+    within = sum(result.within for result in results.values())
+    found = [result.first for result in results.values() if result.first]
+    if found:
+        return 1, f"DIVERGED first at {min(found, key=itemgetter(0))[1]}"
+    if any(result.failure for result in results.values()) or not recording.verdict.complete:
+        expected = sum(MessageId.of(id).stage in executed for id in recording.messages)
+        none = "none differs" if not within else f"{within} within tolerances, none beyond"
+        return 1, f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {recording.verdict}"
+    stages = f"of {len(executed)} stages"
+    if within:
+        allowed = f"none by more than {graph.get('tolerances')} allows"
+        return 0, f"WITHIN TOLERANCES: {within} of {compared} messages {stages} differ, {allowed}"
+    return 0, f"IDENTICAL: {compared} messages {stages}"
 
 
 def _by_cost(recording: Recording) -> list[str]:

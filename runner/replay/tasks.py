@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 
 import msgspec
@@ -26,24 +27,6 @@ from runner.replay.tolerances import outside
 HEADER = tuple(name for name in Envelope.__struct_fields__ if name != "body")
 
 
-class Divergence(msgspec.Struct, frozen=True):
-    """A difference between the recording and the replay."""
-
-    position: int
-    """Of the message in the recording: the lowest comes first."""
-    stage: str
-    replica: int
-    incarnation: int
-    step: int
-    message: str
-    """Id, or what was expected in its place."""
-    difference: str
-
-    def __str__(self) -> str:
-        process = f"{self.stage}[{self.replica}]" + (f" after restart {self.incarnation}" if self.incarnation else "")
-        return f"stage {process}, step {self.step}, message {self.message}: {self.difference}"
-
-
 class Task(msgspec.Struct, frozen=True):
     """What one process executes again: one incarnation of a stage, or a share of a replicated stage's steps."""
 
@@ -54,7 +37,7 @@ class Task(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         share = f" ({self.share + 1} of {self.shares})" if self.shares > 1 else ""
-        return self.stage + (f" after restart {self.incarnation}" if self.incarnation else "") + share
+        return f"{self.stage}{_after_restart(self.incarnation)}{share}"
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -69,7 +52,8 @@ class Result(msgspec.Struct, frozen=True):
     within: int = 0
     """Messages that differ, but no more than tolerances allow."""
     diverged: int = 0
-    first: Divergence | None = None
+    first: tuple[int, str] | None = None
+    """The difference that comes first: position of its message in the recording, and where and how it differs."""
     changes: tuple[FieldChange, ...] = ()
     failure: str = ""
     """Why the stage could not be executed at all."""
@@ -131,7 +115,9 @@ class Reexecution:
         self._recording = recording
         self._node = node
         self.stage = node.construct()
-        numbers = _first_numbers(steps)
+        numbers: dict[str, int] = {}  # where the sequence of each port went on in this incarnation
+        for id in (MessageId.of(id) for step in steps for id in step.emitted):
+            numbers.setdefault(id.port, id.sequence)
         self._executor = Executor(node, self.stage, seed=seed, directory=directory, log=log, numbers=numbers)
         self.seconds = 0.0
 
@@ -199,7 +185,7 @@ class Comparison:
         self._tolerances = tolerances
         self._positions = {id: position for position, id in enumerate(recording.messages)}
         self._summary = Summary()
-        self._found: list[Divergence] = []
+        self._found: list[tuple[int, str]] = []
         self._steps = self._messages = self._within = 0
 
     def add(self, done: Execution) -> None:
@@ -209,12 +195,12 @@ class Comparison:
 
     def result(self, seconds: float, startup: float) -> Result:
         """What all steps came to."""
-        first = min(self._found, key=lambda divergence: divergence.position, default=None)
+        first = min(self._found, key=itemgetter(0), default=None)
         changes = tuple(self._summary.changes)
         found = len(self._found)
         return Result(self._steps, self._messages, seconds, startup, self._within, found, first, changes)
 
-    def _differences(self, done: Execution) -> Iterator[Divergence]:
+    def _differences(self, done: Execution) -> Iterator[tuple[int, str]]:
         step = done.step
         if done.refused:
             yield self._divergence(step, step.emitted[0] if step.emitted else step.handler, done.refused)
@@ -236,14 +222,12 @@ class Comparison:
         """Where two messages differ by more than is allowed, or nothing."""
         self._messages += 1
         recorded = self._recording.envelope(id)
-        if pack(recorded) == pack(replayed):
-            return ""
-        replayed = without_gained_fields(recorded, replayed)
-        if pack(recorded) == pack(replayed):
+        other = what_differs(recorded, replayed)
+        if other is None:
             return ""
         kind = self._node.type.outputs.get(MessageId.of(id).port)
         try:
-            found = list(envelope_differences(kind, recorded, replayed))
+            found = list(envelope_differences(kind, recorded, other))
         except CodecError as error:
             return f"the recorded message cannot be read: {error}"
         self._summary.add(MessageId.of(id).topic, id, found)
@@ -253,9 +237,27 @@ class Comparison:
             return ""
         return str(beyond or "the same values in other bytes")
 
-    def _divergence(self, step: Step, message: str, difference: str) -> Divergence:
+    def _divergence(self, step: Step, message: str, difference: str) -> tuple[int, str]:
+        """``message`` is an id, or what was expected in its place."""
         position = self._positions.get(message, len(self._positions))
-        return Divergence(position, step.stage, step.replica, step.incarnation, step.number, message, difference)
+        return position, f"stage {process_of(step)}, step {step.number}, message {message}: {difference}"
+
+
+def process_of(step: Step) -> str:
+    """The process that took a step, for people."""
+    return f"{step.stage}[{step.replica}]{_after_restart(step.incarnation)}"
+
+
+def _after_restart(incarnation: int) -> str:
+    return f" after restart {incarnation}" if incarnation else ""
+
+
+def what_differs(recorded: Envelope, replayed: Envelope) -> Envelope | None:
+    """A replayed message as far as the recording speaks of it; None where that is the same to the byte."""
+    if pack(recorded) == pack(replayed):
+        return None
+    replayed = without_gained_fields(recorded, replayed)
+    return None if pack(recorded) == pack(replayed) else replayed
 
 
 def envelope_differences(kind: type[Message] | None, recorded: Envelope, replayed: Envelope) -> Iterator[Difference]:
@@ -280,11 +282,3 @@ def opened(graph: Graph, sealed: Envelope) -> Message | None:
         return open_envelope(kind, sealed) if kind else None
     except CodecError as error:
         raise Refused(f"{sealed.id} cannot be read: {error}") from None
-
-
-def _first_numbers(steps: Sequence[Step]) -> dict[str, int]:
-    """Where the sequence of each port went on in this incarnation."""
-    numbers: dict[str, int] = {}
-    for id in (MessageId.of(id) for step in steps for id in step.emitted):
-        numbers.setdefault(id.port, id.sequence)
-    return numbers

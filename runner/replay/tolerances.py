@@ -13,30 +13,25 @@ from runner.recording.recording import Recording
 UNKNOWN = "absent"
 
 
-class Origin:
-    """What has changed between the recording and here."""
-
-    def __init__(self, recording: Recording) -> None:
-        packages, here, names = package_versions(), machine(), numerical(recording.graph)
-        then = recording.aspect("packages", dict[str, str]())
-        # An aspect that an older runner did not record cannot be said to have changed.
-        before = {**here, **recording.aspect("machine", dict[str, str]())}
-        self.same = fingerprint(before, then, names) == fingerprint(here, packages, names)
-        """True where floats must come out equal to the last bit."""
-        self.computing = list(_changes({name: then.get(name, UNKNOWN) for name in names}, packages))
-        self.computing += [change for change in _changes(before, here) if not change.startswith("system ")]
-        others = {name: version for name, version in then.items() if name not in names}
-        source = {"source": recording.run.get("revision") or "unknown"}
-        runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
-        now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
-        self.other = [*_changes(others, packages), *_changes({**source, **runner}, now)]
-
-    def lines(self) -> Iterator[str]:
-        """For people, what matters most first; nothing where nothing has changed."""
-        if not self.same:
-            yield f"FINGERPRINT DIFFERS: {'; '.join(self.computing)}: tolerances apply where a graph has them"
-        if self.other:
-            yield f"changed since the recording: {'; '.join(self.other)}"
+def compare_origin(recording: Recording) -> tuple[bool, list[str]]:
+    """Whether floats must come out equal to the last bit, and what has changed since the recording, as lines."""
+    packages, here, names = package_versions(), machine(), numerical(recording.graph)
+    then = recording.aspect("packages", dict[str, str]())
+    # An aspect that an older runner did not record cannot be said to have changed.
+    before = {**here, **recording.aspect("machine", dict[str, str]())}
+    same = fingerprint(before, then, names) == fingerprint(here, packages, names)
+    lines: list[str] = []
+    if not same:
+        computing = list(_changes({name: then.get(name, UNKNOWN) for name in names}, packages))
+        computing += [change for change in _changes(before, here) if not change.startswith("system ")]
+        lines.append(f"FINGERPRINT DIFFERS: {'; '.join(computing)}: tolerances apply where a graph has them")
+    others = {name: version for name, version in then.items() if name not in names}
+    source = {"source": recording.run.get("revision") or "unknown"}
+    runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
+    now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
+    if other := [*_changes(others, packages), *_changes({**source, **runner}, now)]:
+        lines.append(f"changed since the recording: {'; '.join(other)}")
+    return same, lines
 
 
 def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:

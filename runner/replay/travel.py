@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,15 +20,26 @@ from runner.contract import Message, Refused, Stage
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
+from runner.inspect.compare import clipped
 from runner.inspect.echo import array_text
 from runner.inspect.info import table
-from runner.message.codec import Envelope, Step, pack
+from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, arguments_of
 from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
-from runner.replay.tasks import Execution, Reexecution, Task, envelope_differences, kind_of, opened, steps_of
+from runner.replay.tasks import (
+    Execution,
+    Reexecution,
+    Task,
+    envelope_differences,
+    kind_of,
+    opened,
+    process_of,
+    steps_of,
+    what_differs,
+)
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -39,12 +50,12 @@ PROMPT = "[Enter] next message, p prompt, q quit > "
 def travel(
     path: Path,
     *,
-    assignments: Sequence[str] = (),
-    swaps: Sequence[str] = (),
-    until: str | None = None,
-    condition: str | None = None,
-    step: bool = False,
-    prompt: bool = False,
+    assignments: Sequence[str],
+    swaps: Sequence[str],
+    until: str | None,
+    condition: str | None,
+    step: bool,
+    prompt: bool,
 ) -> int:
     """Stops at message ``until``, or where ``condition`` first holds, or with ``step`` at one message after another.
 
@@ -54,26 +65,19 @@ def travel(
     recording = Recording(path)
     recording.require_messages()
     graph = change(recording, assignments, swaps)
-    start = _start(recording, graph, until, condition)
+    if until is not None:
+        start = _existing(recording, until)
+    elif condition is not None:
+        start = first_match(recording, graph, condition)
+    else:
+        start = next(iter(recording.messages), None)
     if start is None:
         print(f"{condition!r} holds for no message of {path}")
         return 1
+    prompt = prompt or (sys.stdin.isatty() and sys.stdout.isatty())
     with tempfile.TemporaryDirectory() as folder:
-        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt or _attended())
+        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt)
     return 0
-
-
-def _attended() -> bool:
-    return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _start(recording: Recording, graph: Graph, until: str | None, condition: str | None) -> str | None:
-    """The message to stop at; None where the condition never holds."""
-    if until is not None:
-        return _existing(recording, until)
-    if condition is not None:
-        return first_match(recording, graph, condition)
-    return next(iter(recording.messages), None)
 
 
 def _existing(recording: Recording, id: str) -> str:
@@ -145,8 +149,7 @@ class Traveller:
 
     def moment(self, id: str) -> Moment:
         """Executes the stage that emitted a message up to it."""
-        step, kind = self._causes.step_of(id), kind_of(self._graph, id)
-        recorded = self._recording.envelope(id)
+        step, recorded = self._causes.step_of(id), self._recording.envelope(id)
         node = self._graph.nodes.get(MessageId.of(id).stage)
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
@@ -155,7 +158,7 @@ class Traveller:
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
         message = opened(self._graph, sealed) if sealed else None
-        notes = [*self._notes(execution, recorded, sealed, kind), *self._log]
+        notes = [*self._notes(execution, recorded, sealed), *self._log]
         return Moment(id, message, stage, step, execution.arrivals, notes)
 
     def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
@@ -169,9 +172,7 @@ class Traveller:
                 own = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
                 steps = sorted(own, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
-            again = Reexecution(
-                self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._note_log
-            )
+            again = Reexecution(self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._hear)
             self._processes[process] = again.stage, self._executions(again, steps)
         return self._processes[process]
 
@@ -181,20 +182,19 @@ class Traveller:
             self._log.clear()
             yield from again.take(step)
 
-    def _note_log(self, text: str, level: str) -> None:
+    def _hear(self, text: str, level: str) -> None:
         self._log.append(f"{level} of the stage: {text}")
 
-    def _notes(
-        self, done: Execution, recorded: Envelope, sealed: Envelope | None, kind: type[Message] | None
-    ) -> Iterator[str]:
+    def _notes(self, done: Execution, recorded: Envelope, sealed: Envelope | None) -> Iterator[str]:
         if done.refused or done.error:
             yield done.refused or f"the handler raised {done.error}"
         if sealed is None:
             yield "recorded, and not emitted in the replay"
-        elif pack(sealed) == pack(recorded):
+        elif (other := what_differs(recorded, sealed)) is None:
             yield "executed again: identical to the recording"
         else:
-            found = [str(difference) for difference in envelope_differences(kind, recorded, sealed)]
+            kind = kind_of(self._graph, recorded.id)
+            found = [str(difference) for difference in envelope_differences(kind, recorded, other)]
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]
 
@@ -236,36 +236,24 @@ def described(moment: Moment, recording: Recording) -> Iterator[str]:
     sealed = recording.envelope(moment.id)
     yield f"{moment.id}  {sealed.type}, of {sealed.lineage}"
     if moment.step is not None:
-        step = moment.step
-        process = f"{step.stage}[{step.replica}]" + (f" after restart {step.incarnation}" if step.incarnation else "")
-        yield f"  step {step.number} of {process}, {step.handler}"
+        yield f"  step {moment.step.number} of {process_of(moment.step)}, {moment.step.handler}"
     yield from (f"  {note}" for note in moment.notes)
     fields = moment.message.__struct_fields__ if moment.message is not None else ()
     yield from (f"    {name} = {brief(getattr(moment.message, name))}" for name in fields)
     if moment.step is not None and moment.step.consumed:
         yield f"  causes (the whole tree: runner why {moment.id} {recording.path})"
-        yield from (f"    {line}" for line in table(("port", "id", "type"), _causes(moment.step, recording))[1:])
-
-
-def _causes(step: Step, recording: Recording) -> Iterator[tuple[str, ...]]:
-    for port, id in step.consumed:
-        located = recording.messages.get(id)
-        yield port, id, located.type if located else "not recorded"
+        known = recording.messages
+        rows = [(port, id, known[id].type if id in known else "not recorded") for port, id in moment.step.consumed]
+        yield from (f"    {line}" for line in table(("port", "id", "type"), rows)[1:])
 
 
 def brief(value: Any) -> str:
     """A value in one line."""
     if isinstance(value, np.ndarray):
-        return array_text(cast("np.ndarray[Any, Any]", value))
-    if isinstance(value, list | tuple) and value:
-        items = cast("Sequence[Any]", value)
-        if isinstance(items[0], msgspec.Struct | np.ndarray):
-            return f"{len(items)} x {_clipped(brief(items[0]))}"
+        return array_text(value)
+    if isinstance(value, list | tuple) and value and isinstance(value[0], msgspec.Struct | np.ndarray):
+        return f"{len(value)} x {clipped(brief(value[0]), SHOWN)}"
     if isinstance(value, msgspec.Struct):
         fields = (f"{name}={brief(getattr(value, name))}" for name in value.__struct_fields__)
-        return _clipped(f"{type(value).__name__}({', '.join(fields)})")
-    return _clipped(repr(value))
-
-
-def _clipped(text: str) -> str:
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+        return clipped(f"{type(value).__name__}({', '.join(fields)})", SHOWN)
+    return clipped(repr(value), SHOWN)

@@ -6,9 +6,8 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast, get_args
 
 from runner.contract import Message, Refused, Scorer
 from runner.graph.document import suggest
@@ -16,28 +15,31 @@ from runner.graph.graph import Graph, node_entry
 from runner.graph.references import load_class
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
-from runner.message.codec import Envelope, pack
+from runner.message.codec import Envelope
 from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 from runner.replay.partial import PartialReplay
-from runner.replay.replay import Say, change
-from runner.replay.tasks import envelope_differences, kind_of, opened
-from runner.replay.tolerances import Origin
+from runner.replay.replay import change
+from runner.replay.tasks import envelope_differences, kind_of, opened, what_differs
+from runner.replay.tolerances import compare_origin
 
 SHOWN = 5
 """Ids that are named before ``and N more``."""
+Effect = Literal["identical", "changed", "appeared", "vanished"]
+"""What becomes of a message."""
+EFFECTS: tuple[Effect, ...] = get_args(Effect)
+DIFFERENT: tuple[Effect, ...] = EFFECTS[1:]
 
 
 def what_if(
     path: Path,
     *,
-    assignments: Sequence[str] = (),
-    swaps: Sequence[str] = (),
-    origins: Sequence[str] = (),
-    workers: int | None = None,
-    say: Say,
+    assignments: Sequence[str],
+    swaps: Sequence[str],
+    origins: Sequence[str],
+    workers: int | None,
 ) -> int:
-    """Executes what follows from a change again and says what it changes.
+    """Executes what follows from a change again and prints what it changes.
 
     ``assignments`` are ``--set``'s, ``swaps`` are ``stage=module:Class``, ``origins`` stages that are executed though
     nothing about them changes. Returns 0, or 1 where a handler raised. Raises Refused where the change is impossible.
@@ -46,14 +48,16 @@ def what_if(
     recording.require_messages()
     graph = change(recording, assignments, swaps)
     names = affected_by(graph, _changed(recording, graph) | _known(graph, origins, "--from"))
-    for line in (*Origin(recording).lines(), f"{path}: {recording.verdict}", *_plan(graph, names)):
-        say(line)
+    _, changes = compare_origin(recording)
+    frozen = ", ".join(name for name in graph.nodes if name not in names)
+    what = f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
+    print(*changes, f"{path}: {recording.verdict}", what, sep="\n")
     with tempfile.TemporaryDirectory() as folder:
         workers = workers or len(os.sched_getaffinity(0))
         replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
         replay.run()
     for line in _verdict(recording, graph, names, replay):
-        say(line)
+        print(line)
     return int(bool(replay.errors))
 
 
@@ -95,85 +99,64 @@ def affected_by(graph: Graph, origins: Collection[str]) -> list[str]:
     return [name for name in graph.nodes if name in found]
 
 
-def _plan(graph: Graph, names: Sequence[str]) -> Iterator[str]:
-    frozen = ", ".join(name for name in graph.nodes if name not in names)
-    yield f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
-
-
 # ------------------------------------------------------------------------------------ the verdict
 
 
-@dataclass(slots=True)
-class Effects:
-    """What the change changes, by message."""
-
-    identical: list[str] = field(default_factory=list[str])
-    changed: list[str] = field(default_factory=list[str])
-    appeared: list[str] = field(default_factory=list[str])
-    vanished: list[str] = field(default_factory=list[str])
-    summary: Summary = field(default_factory=Summary)
-
-    @property
-    def words(self) -> str:
-        """The counts, for people."""
-        kinds = ("changed", "appeared", "vanished", "identical")
-        return ", ".join(f"{len(getattr(self, kind))} {kind}" for kind in kinds if getattr(self, kind)) or "no messages"
-
-
-def effects_of(recording: Recording, graph: Graph, names: Collection[str], emitted: Mapping[str, Envelope]) -> Effects:
-    """Compares what was emitted with what is recorded of the same stages."""
-    effects = Effects()
-    recorded = (id for id in recording.messages if MessageId.of(id).stage in names)
-    for id in recorded:
-        if id not in emitted:
-            effects.vanished.append(id)
+def effects_of(
+    recording: Recording, graph: Graph, names: Collection[str], emitted: Mapping[str, Envelope]
+) -> tuple[dict[Effect, list[str]], Summary]:
+    """Compares what was emitted with what is recorded of the same stages: ids by effect, and which fields differ."""
+    effects: dict[Effect, list[str]] = {effect: [] for effect in EFFECTS}
+    summary = Summary()
+    for id in recording.messages:
+        if MessageId.of(id).stage not in names:
             continue
-        before, now = recording.envelope(id), emitted[id]
-        same = pack(before) == pack(now)
-        (effects.identical if same else effects.changed).append(id)
-        found = () if same else envelope_differences(kind_of(graph, id), before, now)
-        effects.summary.add(MessageId.of(id).topic, id, found)
-    effects.appeared = [id for id in emitted if id not in recording.messages]
-    return effects
+        if id not in emitted:
+            effects["vanished"].append(id)
+            continue
+        before = recording.envelope(id)
+        now = what_differs(before, emitted[id])
+        effects["identical" if now is None else "changed"].append(id)
+        found = () if now is None else envelope_differences(kind_of(graph, id), before, now)
+        summary.add(MessageId.of(id).topic, id, found)
+    effects["appeared"] += (id for id in emitted if id not in recording.messages)
+    return effects, summary
 
 
 def _verdict(recording: Recording, graph: Graph, names: Sequence[str], replay: PartialReplay) -> Iterator[str]:
-    effects = effects_of(recording, graph, names, replay.emitted)
+    effects, summary = effects_of(recording, graph, names, replay.emitted)
     yield ""
     yield from _by_topic(effects)
-    if effects.changed:
+    if effects["changed"]:
         yield ""
-        yield from effects.summary.lines()
-    yield from (f"{kind}: {_listed(ids)}" for kind in ("appeared", "vanished") if (ids := getattr(effects, kind)))
+        yield from summary.lines()
+    yield from (f"{effect}: {_listed(effects[effect])}" for effect in ("appeared", "vanished") if effects[effect])
     yield from _devices(graph, names, effects)
-    lost = replay.never_came()
-    if lost:
+    if lost := replay.frozen.blocked():
         yield f"devices answered what is not asked any more, left out: {_listed(lost)}"
     yield from (f"FAILED {error}" for error in replay.errors)
     yield ""
     yield from _scores(recording, graph, names, replay)
-    same = not (effects.changed or effects.appeared or effects.vanished)
-    yield f"{'NOTHING CHANGES' if same else 'CHANGED'}: {effects.words}, of {len(names)} stages"
+    same = not any(effects[effect] for effect in DIFFERENT)
+    counts = (f"{len(effects[effect])} {effect}" for effect in (*DIFFERENT, "identical") if effects[effect])
+    yield f"{'NOTHING CHANGES' if same else 'CHANGED'}: {', '.join(counts) or 'no messages'}, of {len(names)} stages"
 
 
-def _by_topic(effects: Effects) -> list[str]:
-    kinds = ("identical", "changed", "appeared", "vanished")
-    counts = {kind: Counter(MessageId.of(id).topic for id in getattr(effects, kind)) for kind in kinds}
-    topics = sorted({topic for by_topic in counts.values() for topic in by_topic})
-    rows = [(topic, *(str(counts[kind][topic] or "-") for kind in kinds)) for topic in topics]
-    return table(("topic", *kinds), rows)
+def _by_topic(effects: Mapping[Effect, Sequence[str]]) -> list[str]:
+    counts = [Counter(MessageId.of(id).topic for id in ids) for ids in effects.values()]
+    topics = sorted({topic for by_topic in counts for topic in by_topic})
+    rows = [(topic, *(str(by_topic[topic] or "-") for by_topic in counts)) for topic in topics]
+    return table(("topic", *effects), rows)
 
 
-def _devices(graph: Graph, names: Collection[str], effects: Effects) -> Iterator[str]:
+def _devices(graph: Graph, names: Collection[str], effects: Mapping[Effect, Sequence[str]]) -> Iterator[str]:
     """Where it ends at a device: what it would have been sent, and that its recorded answers stand."""
     for device in (node for node in graph.nodes.values() if node.type.cls.device):
         sources = {f"{edge.stage}/{edge.port}" for edge in device.inputs.values() if edge.stage in names}
-        said: list[str] = []
-        for kind in ("changed", "appeared", "vanished"):
-            ids = [id for id in getattr(effects, kind) if MessageId.of(id).topic in sources]
-            said += [f"{kind} {_listed(ids)}"] if ids else []
+        sent = {effect: [id for id in effects[effect] if MessageId.of(id).topic in sources] for effect in DIFFERENT}
+        said = "; ".join(f"{effect} {_listed(ids)}" for effect, ids in sent.items() if ids)
         if said:
-            yield f"device {device.name} would have been sent: {'; '.join(said)}. What it emitted stays as recorded"
+            yield f"device {device.name} would have been sent: {said}. What it emitted stays as recorded"
 
 
 def _listed(ids: Sequence[str]) -> str:
@@ -205,7 +188,7 @@ def _score_row(name: str, before: float | None, now: float | None) -> tuple[str,
 def _new_run(recording: Recording, names: Collection[str], replay: PartialReplay) -> Iterator[Envelope]:
     """Every message as it would have been: in the place of the recorded one, new ones at the end."""
     for id in recording.messages:
-        sealed = replay.emitted.get(id) if MessageId.of(id).stage in names else replay.frozen.get(id)
+        sealed = replay.emitted.get(id) if MessageId.of(id).stage in names else replay.frozen.released.get(id)
         if sealed is not None:
             yield sealed
     yield from (sealed for id, sealed in replay.emitted.items() if id not in recording.messages)

@@ -6,11 +6,10 @@ import os
 import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Generic, TypeVar, cast
+from typing import TypeVar, cast
 
 from runner.process.children import PARENT, die_with_parent, ending, last_lines
 from runner.process.forks import Forked, fork
@@ -20,7 +19,7 @@ T = TypeVar("T")
 STOP_SECONDS = 5.0
 
 
-class Worker:
+class Worker(Forked):
     """One forked process and the connection to it."""
 
     def __init__(self, work: Callable[[Connection], None], log: Path) -> None:
@@ -29,51 +28,42 @@ class Worker:
         log.touch()
         parent = os.getpid()
         self.connection, theirs = Pipe()
-        self._process = Forked(fork(lambda: _work(work, theirs, self.connection, parent), log))
+
+        def begin() -> None:
+            self.connection.close()
+            os.environ[PARENT] = str(parent)
+            die_with_parent()
+            work(theirs)
+
+        super().__init__(fork(begin, log))
         theirs.close()
 
-    def receive(self) -> bytes:
-        """What the process sends next; raises EOFError where it has ended instead."""
-        return self.connection.recv_bytes()
+    def send(self, request: bytes) -> None:
+        """To one that has ended nothing is sent: who receives next is told."""
+        with suppress(BrokenPipeError):
+            self.connection.send_bytes(request)
 
     def end(self) -> str:
         """Waits for a process that has nothing more to say, and says how it ended."""
         self.connection.close()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(STOP_SECONDS)
+            self.wait(STOP_SECONDS)
         self.kill()
-        return ": ".join([f"its process {ending(self._process.wait())}", *last_lines(self.log, 1)])
-
-    def kill(self) -> None:
-        """Leaves nothing behind."""
-        self._process.kill()
+        return ": ".join([f"its process {ending(self.wait())}", *last_lines(self.log, 1)])
 
 
-def _work(work: Callable[[Connection], None], own: Connection, foreign: Connection, parent: int) -> None:
-    foreign.close()
-    os.environ[PARENT] = str(parent)
-    die_with_parent()
-    work(own)
-
-
-@dataclass(frozen=True, slots=True)
-class Job(Generic[T]):
-    """Something to do in a process of its own."""
-
-    item: T
-    work: Callable[[], bytes]
-
-
-def run_each(jobs: Iterable[Job[T]], *, workers: int, folder: Path) -> Iterator[tuple[T, bytes | str]]:
+def run_each(
+    jobs: Iterable[tuple[T, Callable[[], bytes]]], *, workers: int, folder: Path
+) -> Iterator[tuple[T, bytes | str]]:
     """Does every job in a process of its own, ``workers`` at a time; yields each answer as it comes, or why there is
     none. Jobs are drawn one ahead, so that what a generator of them imports is imported while others work."""
     running: dict[Connection, tuple[T, Worker]] = {}
     try:
-        for number, job in enumerate(jobs):
+        for number, (item, work) in enumerate(jobs):
             while len(running) >= workers:
                 yield _collected(running)
-            child = Worker(_answering(job.work), folder / f"{number}.txt")
-            running[child.connection] = (job.item, child)
+            child = Worker(lambda connection, work=work: connection.send_bytes(work()), folder / f"{number}.txt")
+            running[child.connection] = (item, child)
         while running:
             yield _collected(running)
     finally:
@@ -81,15 +71,11 @@ def run_each(jobs: Iterable[Job[T]], *, workers: int, folder: Path) -> Iterator[
             child.kill()
 
 
-def _answering(work: Callable[[], bytes]) -> Callable[[Connection], None]:
-    return lambda connection: connection.send_bytes(work())
-
-
 def _collected(running: dict[Connection, tuple[T, Worker]]) -> tuple[T, bytes | str]:
     ready = cast("Connection", wait(list(running))[0])
     item, child = running.pop(ready)
     try:
-        answer: bytes | str = child.receive()
+        answer = ready.recv_bytes()
     except EOFError:
         return item, child.end()
     child.end()

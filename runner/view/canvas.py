@@ -19,14 +19,12 @@ TIME = "time"
 class Canvas:
     """One Rerun stream with a ``step`` timeline (one step per message or animation frame) and the logical ``time``."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self.stream = stream
-        self._step = -1
-
-    def start(self, layout: d.Layout, static: Iterable[d.Drawing]) -> None:
+    def __init__(self, stream: rr.RecordingStream, views: d.Views) -> None:
         """Sends the arrangement of the panels and what never changes."""
-        self.stream.send_blueprint(blueprint(layout), make_active=True, make_default=True)
-        for drawing in static:
+        self._stream = stream
+        self._step = -1
+        stream.send_blueprint(_blueprint(views.layout()), make_active=True, make_default=True)
+        for drawing in views.static():
             self._put(drawing, static=True)
 
     def show(self, drawings: Iterable[d.Drawing], *, time_ns: int) -> None:
@@ -41,69 +39,51 @@ class Canvas:
 
     def _advance(self, time_ns: int) -> None:
         self._step += 1
-        self.stream.set_time(STEP, sequence=self._step)
-        self.stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
+        self._stream.set_time(STEP, sequence=self._step)
+        self._stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
-        for path, archetype in _ARCHETYPES[type(drawing)](drawing):
-            self.stream.log(path, archetype, static=static)
+        found = _ARCHETYPES[type(drawing)](drawing)
+        for archetype in found if isinstance(found, list) else [found]:
+            self._stream.log(drawing.path, archetype, static=static)
 
 
-Logged = Iterable[tuple[str, Any]]
-
-
-def _image(image: d.Image) -> Logged:
-    overlay = image.opacity < 1 or image.rgb.shape[2] == 4
-    yield image.path, rr.Image(image.rgb, opacity=image.opacity, draw_order=-5 if overlay else -10)
-
-
-def _depth(depth: d.DepthImage) -> Logged:
+def _depth(depth: d.DepthImage) -> rr.DepthImage:
     seen = depth.depth[depth.depth > 0]
     lowest = depth.nearest if depth.nearest is not None else float(seen.min(initial=np.inf))
     highest = depth.farthest if depth.farthest is not None else float(seen.max(initial=0.0))
     extent = (lowest, highest) if lowest < highest else (0.0, 1.0)
-    yield depth.path, rr.DepthImage(depth.depth, meter=1.0, colormap="turbo", depth_range=extent)
+    return rr.DepthImage(depth.depth, meter=1.0, colormap="turbo", depth_range=extent)
 
 
-def _boxes(boxes: d.Boxes2D) -> Logged:
-    yield (
-        boxes.path,
-        rr.Boxes2D(
-            array=np.asarray(boxes.boxes, dtype=np.float64).reshape(-1, 4),
-            array_format=rr.Box2DFormat.XYXY,
-            labels=boxes.labels or None,
-            colors=boxes.colors or None,
-        ),
+def _image(image: d.Image) -> rr.Image:
+    overlay = image.opacity < 1 or image.rgb.shape[2] == 4
+    return rr.Image(image.rgb, opacity=image.opacity, draw_order=-5 if overlay else -10)
+
+
+def _boxes(boxes: d.Boxes2D) -> rr.Boxes2D:
+    corners = np.asarray(boxes.boxes, dtype=np.float64).reshape(-1, 4)
+    labels, colors = boxes.labels or None, boxes.colors or None
+    return rr.Boxes2D(array=corners, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colors)
+
+
+def _pinhole(camera: d.Pinhole) -> rr.Pinhole:
+    return rr.Pinhole(
+        image_from_camera=camera.K,
+        resolution=(camera.width, camera.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.3,
     )
 
 
-def _pinhole(camera: d.Pinhole) -> Logged:
-    yield (
-        camera.path,
-        rr.Pinhole(
-            image_from_camera=camera.K,
-            resolution=(camera.width, camera.height),
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.3,
-        ),
-    )
-
-
-def _transform(transform: d.Transform) -> Logged:
-    yield transform.path, rr.Transform3D(translation=transform.T[:3, 3], mat3x3=transform.T[:3, :3])
-
-
-def _mesh(mesh: d.Mesh3D) -> Logged:
+def _mesh(mesh: d.Mesh3D) -> rr.Mesh3D:
     one = isinstance(mesh.colors, tuple)
-    yield (
-        mesh.path,
-        rr.Mesh3D(
-            vertex_positions=mesh.vertices,
-            triangle_indices=mesh.faces,
-            vertex_normals=_normals(np.asarray(mesh.vertices, np.float64), mesh.faces),
-            vertex_colors=None if one else mesh.colors,
-            albedo_factor=mesh.colors if one else None,
-        ),
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=_normals(np.asarray(mesh.vertices, np.float64), mesh.faces),
+        vertex_colors=None if one else mesh.colors,
+        albedo_factor=mesh.colors if one else None,
     )
 
 
@@ -117,52 +97,32 @@ def _normals(vertices: d.Floats, faces: NDArray[np.integer[Any]]) -> d.Floats:
     return normals / np.where(lengths > 0, lengths, 1)
 
 
-def _points(points: d.Points3D) -> Logged:
-    yield points.path, rr.Points3D(points.positions, colors=points.colors, radii=points.radius)
-
-
-def _lines(lines: d.Lines3D) -> Logged:
-    yield lines.path, rr.LineStrips3D(list(lines.strips), colors=lines.color, radii=lines.radius)
-
-
-def _text(text: d.Text) -> Logged:
-    yield text.path, rr.TextDocument(text.markdown, media_type=rr.MediaType.MARKDOWN)
-
-
-def _graph(graph: d.Graph) -> Logged:
+def _graph(graph: d.Graph) -> list[Any]:
     nodes = rr.GraphNodes(graph.nodes, labels=graph.labels, colors=graph.colors or None, positions=graph.positions)
-    yield graph.path, nodes
-    yield graph.path, rr.GraphEdges(graph.edges, graph_type="directed")
+    return [nodes, rr.GraphEdges(graph.edges, graph_type="directed")]
 
 
-def _scalar(scalar: d.Scalar) -> Logged:
-    yield scalar.path, rr.SeriesLines(names=scalar.name or scalar.path.rpartition("/")[2])
-    yield scalar.path, rr.Scalars(scalar.value)
+def _scalar(scalar: d.Scalar) -> list[Any]:
+    name = scalar.name or scalar.path.rpartition("/")[2]
+    return [rr.SeriesLines(names=name), rr.Scalars(scalar.value)]
 
 
-def _bars(bars: d.BarChart) -> Logged:
-    yield bars.path, rr.BarChart(bars.values, color=bars.color)
-
-
-def _clear(clear: d.Clear) -> Logged:
-    yield clear.path, rr.Clear(recursive=True)
-
-
-_ARCHETYPES: dict[type, Callable[[Any], Logged]] = {
+_ARCHETYPES: dict[type, Callable[[Any], Any]] = {
     d.Image: _image,
     d.DepthImage: _depth,
     d.Boxes2D: _boxes,
     d.Pinhole: _pinhole,
-    d.Transform: _transform,
+    d.Transform: lambda place: rr.Transform3D(translation=place.T[:3, 3], mat3x3=place.T[:3, :3]),
     d.Mesh3D: _mesh,
-    d.Points3D: _points,
-    d.Lines3D: _lines,
-    d.Text: _text,
+    d.Points3D: lambda points: rr.Points3D(points.positions, colors=points.colors, radii=points.radius),
+    d.Lines3D: lambda lines: rr.LineStrips3D(list(lines.strips), colors=lines.color, radii=lines.radius),
+    d.Text: lambda text: rr.TextDocument(text.markdown, media_type=rr.MediaType.MARKDOWN),
     d.Graph: _graph,
     d.Scalar: _scalar,
-    d.BarChart: _bars,
-    d.Clear: _clear,
+    d.BarChart: lambda bars: rr.BarChart(bars.values, color=bars.color),
+    d.Clear: lambda _: rr.Clear(recursive=True),
 }
+"""What Rerun shows each drawing as: one archetype, or several."""
 
 _PANELS: dict[d.PanelKind, Callable[..., Any]] = {
     "image": rrb.Spatial2DView,
@@ -174,8 +134,8 @@ _PANELS: dict[d.PanelKind, Callable[..., Any]] = {
 }
 
 
-def blueprint(layout: d.Layout) -> rrb.Blueprint:
-    """The layout as a Rerun blueprint that follows the ``step`` timeline, with the side panels folded away."""
+def _blueprint(layout: d.Layout) -> rrb.Blueprint:
+    """Follows the ``step`` timeline, with the side panels folded away."""
     return rrb.Blueprint(
         _part(layout),
         rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following"),

@@ -26,20 +26,25 @@ Color = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
-    """A colour image. Images below one path are laid over each other; a lower ``opacity`` lets the other show."""
+class Drawing:
+    """What stands at a path."""
 
     path: str
+
+
+@dataclass(frozen=True, slots=True)
+class Image(Drawing):
+    """A colour image. Images below one path are laid over each other; a lower ``opacity`` lets the other show."""
+
     rgb: Bytes
     """H x W x 3, or H x W x 4 with an alpha channel (0 is transparent)."""
     opacity: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class DepthImage:
+class DepthImage(Drawing):
     """A depth image, coloured by distance. Below a :class:`Pinhole` it also becomes a point cloud in space."""
 
-    path: str
     depth: Floats
     """H x W, metres along the optical axis, 0 where there is no reading."""
     nearest: float | None = None
@@ -48,10 +53,9 @@ class DepthImage:
 
 
 @dataclass(frozen=True, slots=True)
-class Boxes2D:
+class Boxes2D(Drawing):
     """Axis-aligned boxes over an image, each with a label."""
 
-    path: str
     boxes: Floats
     """N x 4: x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""
     labels: tuple[str, ...] = ()
@@ -60,10 +64,9 @@ class Boxes2D:
 
 
 @dataclass(frozen=True, slots=True)
-class Pinhole:
+class Pinhole(Drawing):
     """Makes ``path`` a camera: what lies below it is its image; z forward, x right, y down."""
 
-    path: str
     K: Floats
     """3 x 3, pixels."""
     width: int
@@ -71,19 +74,17 @@ class Pinhole:
 
 
 @dataclass(frozen=True, slots=True)
-class Transform:
+class Transform(Drawing):
     """Places ``path`` and everything below it in the frame above."""
 
-    path: str
     T: Floats
     """4 x 4, ``T_parent_path``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Mesh3D:
+class Mesh3D(Drawing):
     """Triangles in the frame of ``path``."""
 
-    path: str
     vertices: Floats
     """V x 3, metres."""
     faces: NDArray[np.integer[Any]]
@@ -93,10 +94,9 @@ class Mesh3D:
 
 
 @dataclass(frozen=True, slots=True)
-class Points3D:
+class Points3D(Drawing):
     """Points in the frame of ``path``."""
 
-    path: str
     positions: Floats
     """N x 3, metres."""
     colors: Bytes | Color | None = None
@@ -106,10 +106,9 @@ class Points3D:
 
 
 @dataclass(frozen=True, slots=True)
-class Lines3D:
+class Lines3D(Drawing):
     """Polylines in the frame of ``path``."""
 
-    path: str
     strips: tuple[Floats, ...]
     """Each N x 3, metres."""
     color: Color | None = None
@@ -118,18 +117,16 @@ class Lines3D:
 
 
 @dataclass(frozen=True, slots=True)
-class Text:
+class Text(Drawing):
     """A page of Markdown."""
 
-    path: str
     markdown: str
 
 
 @dataclass(frozen=True, slots=True)
-class Graph:
+class Graph(Drawing):
     """A graph of labelled nodes."""
 
-    path: str
     nodes: tuple[str, ...]
     """Unique names."""
     labels: tuple[str, ...]
@@ -143,53 +140,34 @@ class Graph:
 
 
 @dataclass(frozen=True, slots=True)
-class Scalar:
+class Scalar(Drawing):
     """One value of a curve over steps."""
 
-    path: str
     value: float
     name: str = ""
     """In the legend; the path's last part by default."""
 
 
 @dataclass(frozen=True, slots=True)
-class BarChart:
+class BarChart(Drawing):
     """One bar per value."""
 
-    path: str
     values: Floats
     """Length N."""
     color: Color | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Clear:
+class Clear(Drawing):
     """Removes what stands at ``path`` and below it."""
-
-    path: str
 
 
 @dataclass(frozen=True, slots=True)
-class NextStep:
+class NextStep(Drawing):
     """What follows is shown one step later: yielded between the frames of an animation, as a filter's iterations."""
 
+    path: str = ""
 
-Drawing = (
-    Image
-    | DepthImage
-    | Boxes2D
-    | Pinhole
-    | Transform
-    | Mesh3D
-    | Points3D
-    | Lines3D
-    | Text
-    | Graph
-    | Scalar
-    | BarChart
-    | Clear
-    | NextStep
-)
 
 PanelKind = Literal["image", "space", "graph", "text", "bars", "series"]
 

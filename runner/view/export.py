@@ -17,8 +17,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from runner.contract import Level, Refused
-from runner.graph.graph import graph_from_json
+from runner.contract import Refused
+from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import LogLine
 from runner.recording.recording import Recording
 from runner.view import drawing as d
@@ -58,8 +58,8 @@ def export(path: Path, target: Path) -> list[str]:
         with target.open("xb") as output:
             sink = _Sink(Writer(output, compression=CompressionType.ZSTD))
             for line in recording.log:
-                sink.put(LOGS, _log_line(line), line.time_ns)
-            _write_drawings(recording, views, lambda id: drawn(graph, views, recording.envelope(id)), sink)
+                sink.put([(LOGS, _log_line(line))], line.time_ns)
+            _write_drawings(recording, graph, views, sink)
             sink.finish()
     except OSError as error:
         raise Refused(f"{target}: cannot be written: {error.strerror}") from None
@@ -67,21 +67,19 @@ def export(path: Path, target: Path) -> list[str]:
     return [f"{path}: {recording.verdict}", f"{target}: {kinds or 'nothing to show'}"]
 
 
-def _write_drawings(
-    recording: Recording, views: d.Views, draw: Callable[[str], Sequence[d.Drawing]], sink: _Sink
-) -> None:
+def _write_drawings(recording: Recording, graph: Graph, views: d.Views, sink: _Sink) -> None:
     """In the order of recording. Animations take time: what follows is never shown before they have ended."""
     scribe = _Scribe()
     now = min((message.log_time_ns for message in recording.messages.values()), default=0)
-    sink.put_all(scribe.written(list(views.static()), now), now)
+    sink.put(scribe.written(list(views.static()), now), now)
     for id, message in recording.messages.items():
         now = max(now, message.log_time_ns)
-        for number, step in enumerate(_steps(draw(id))):
+        for number, step in enumerate(_steps(drawn(graph, views, recording.envelope(id)))):
             now += STEP_NS if number else 0
-            sink.put_all(scribe.written(step, now), now)
+            sink.put(scribe.written(step, now), now)
 
 
-def _steps(drawings: Sequence[d.Drawing]) -> Iterator[list[d.Drawing]]:
+def _steps(drawings: Iterable[d.Drawing]) -> Iterator[list[d.Drawing]]:
     step: list[d.Drawing] = []
     for drawing in drawings:
         if isinstance(drawing, d.NextStep):
@@ -101,23 +99,20 @@ class _Sink:
         self._channels: dict[str, int] = {}
         writer.start(profile="", library="scene-programming")
 
-    def put_all(self, written: Iterable[Written], time_ns: int) -> None:
+    def put(self, written: Iterable[Written], time_ns: int) -> None:
         for topic, message in written:
-            self.put(topic, message, time_ns)
-
-    def put(self, topic: str, message: Any, time_ns: int) -> None:
-        plain = isinstance(message, dict)
-        if topic not in self._channels:
-            self._channels[topic] = self._register(topic, message, plain)
-        data = json.dumps(message).encode() if plain else message.encode()
-        self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
-        self.counts["JSON" if plain else type(message).__name__] += 1
+            plain = isinstance(message, dict)
+            if topic not in self._channels:
+                self._channels[topic] = self._register(topic, message)
+            data = json.dumps(message).encode() if plain else message.encode()
+            self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
+            self.counts["JSON" if plain else type(message).__name__] += 1
 
     def finish(self) -> None:
         self._writer.finish()
 
-    def _register(self, topic: str, message: Any, plain: bool) -> int:
-        if plain:
+    def _register(self, topic: str, message: Any) -> int:
+        if isinstance(message, dict):
             schema = self._writer.register_schema("drawing", "jsonschema", b'{"type": "object"}')
             return self._writer.register_channel(topic, "json", schema)
         described = type(message).get_schema()
@@ -135,15 +130,19 @@ class _Scribe:
 
     def written(self, drawings: Sequence[d.Drawing], now: int) -> Iterator[Written]:
         """Places come first: what is drawn below them in the same step is in their frame."""
-        self._frames.update(_clean(drawing.path) for drawing in drawings if isinstance(drawing, d.Transform))
+        self._frames.update(_clean(drawing) for drawing in drawings if isinstance(drawing, d.Transform))
         for drawing in drawings:
             if isinstance(drawing, d.Clear):
-                yield from self._cleared(_clean(drawing.path), now)
+                yield from self._cleared(_clean(drawing), now)
             elif not isinstance(drawing, d.NextStep):
-                path = _clean(drawing.path)
-                self._standing[path] = drawing
-                frame = self._parent(path) if isinstance(drawing, d.Transform) else self._frame(path)
-                yield from _MAPPINGS[type(drawing)](drawing, path, frame, _stamp(now))
+                self._standing[_clean(drawing)] = drawing
+                yield self._one(drawing, now)
+
+    def _one(self, drawing: d.Drawing, now: int) -> Written:
+        path = _clean(drawing)
+        frame = self._parent(path) if isinstance(drawing, d.Transform) else self._frame(path)
+        message = _MESSAGES[type(drawing)](drawing, path, frame, _stamp(now))
+        return _TOPICS.get(type(drawing), f"/{path}"), message
 
     def _frame(self, path: str) -> str:
         """The nearest place at or above a path; its first part where there is none."""
@@ -156,18 +155,17 @@ class _Scribe:
         return self._frame(above) if above else "root"
 
     def _cleared(self, path: str, now: int) -> Iterator[Written]:
-        stamp = _stamp(now)
         gone = [place for place in self._standing if place == path or place.startswith(f"{path}/")]
         for place in gone:
             match self._standing.pop(place):
                 case d.Mesh3D() | d.Lines3D():
                     kind = fox.SceneEntityDeletionType.MatchingId
-                    deletion = fox.SceneEntityDeletion(timestamp=stamp, type=kind, id=place)
+                    deletion = fox.SceneEntityDeletion(timestamp=_stamp(now), type=kind, id=place)
                     yield SCENE, fox.SceneUpdate(deletions=[deletion])
                 case d.Points3D():
-                    yield from _points(d.Points3D(place, np.zeros((0, 3))), place, self._frame(place), stamp)
+                    yield self._one(d.Points3D(place, np.zeros((0, 3))), now)
                 case d.Boxes2D():
-                    yield from _boxes(d.Boxes2D(place, np.zeros((0, 4))), place, self._frame(place), stamp)
+                    yield self._one(d.Boxes2D(place, np.zeros((0, 4))), now)
                 case _:
                     pass
 
@@ -176,21 +174,21 @@ def _stamp(time_ns: int) -> fox.Timestamp:
     return fox.Timestamp(*divmod(time_ns, 10**9))
 
 
-def _clean(path: str) -> str:
-    return path.strip("/")
+def _clean(drawing: d.Drawing) -> str:
+    return drawing.path.strip("/")
 
 
-def _image(image: d.Image, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    encoding = "rgba8" if image.rgb.shape[2] == 4 else "rgb8"
-    yield f"/{path}", _raw_image(np.ascontiguousarray(image.rgb), encoding, frame, stamp)
+def _image(image: d.Image, path: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
+    return _raw_image(image.rgb, "rgba8" if image.rgb.shape[2] == 4 else "rgb8", frame, stamp)
 
 
-def _depth(depth: d.DepthImage, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _depth(depth: d.DepthImage, path: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
     """Metres as they are, in 32-bit floats."""
-    yield f"/{path}", _raw_image(np.ascontiguousarray(depth.depth, np.float32), "32FC1", frame, stamp)
+    return _raw_image(np.asarray(depth.depth, np.float32), "32FC1", frame, stamp)
 
 
 def _raw_image(pixels: NDArray[Any], encoding: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
+    pixels = np.ascontiguousarray(pixels)
     height, width = pixels.shape[:2]
     return fox.RawImage(
         timestamp=stamp,
@@ -203,45 +201,42 @@ def _raw_image(pixels: NDArray[Any], encoding: str, frame: str, stamp: fox.Times
     )
 
 
-def _boxes(boxes: d.Boxes2D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    colors = boxes.colors or (_GREY,) * len(boxes.boxes)
-    outlines = [_outline(box, color, stamp) for box, color in zip(boxes.boxes.tolist(), colors, strict=True)]
+def _boxes(boxes: d.Boxes2D, path: str, frame: str, stamp: fox.Timestamp) -> fox.ImageAnnotations:
+    colors = [_color(color) for color in boxes.colors or (_GREY,) * len(boxes.boxes)]
+    corners = boxes.boxes.tolist()
+    outlines = [_outline(box, color, stamp) for box, color in zip(corners, colors, strict=True)]
     labels = [
         fox.TextAnnotation(
-            timestamp=stamp, position=_point2(*box[:2]), text=label, font_size=LABEL_PIXELS, text_color=_color(color)
+            timestamp=stamp, position=fox.Point2(x=x, y=y), text=label, font_size=LABEL_PIXELS, text_color=color
         )
-        for box, color, label in zip(boxes.boxes.tolist(), colors, boxes.labels, strict=False)
+        for (x, y, *_), color, label in zip(corners, colors, boxes.labels, strict=False)
     ]
-    yield f"/{path}", fox.ImageAnnotations(timestamp=stamp, points=outlines, texts=labels)
+    return fox.ImageAnnotations(timestamp=stamp, points=outlines, texts=labels)
 
 
-def _outline(box: Sequence[float], color: d.Color, stamp: fox.Timestamp) -> fox.PointsAnnotation:
+def _outline(box: Sequence[float], color: fox.Color, stamp: fox.Timestamp) -> fox.PointsAnnotation:
     x0, y0, x1, y1 = box
-    corners = [_point2(x0, y0), _point2(x1, y0), _point2(x1, y1), _point2(x0, y1)]
+    corners = [fox.Point2(x=x, y=y) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
     kind = fox.PointsAnnotationType.LineLoop
-    return fox.PointsAnnotation(timestamp=stamp, type=kind, points=corners, outline_color=_color(color), thickness=2)
+    return fox.PointsAnnotation(timestamp=stamp, type=kind, points=corners, outline_color=color, thickness=2)
 
 
-def _pinhole(camera: d.Pinhole, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _pinhole(camera: d.Pinhole, path: str, frame: str, stamp: fox.Timestamp) -> fox.CameraCalibration:
     K = np.asarray(camera.K, np.float64)
-    yield (
-        f"/{path}",
-        fox.CameraCalibration(
-            timestamp=stamp,
-            frame_id=frame,
-            width=camera.width,
-            height=camera.height,
-            K=K.ravel().tolist(),
-            R=np.eye(3).ravel().tolist(),
-            P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
-        ),
+    return fox.CameraCalibration(
+        timestamp=stamp,
+        frame_id=frame,
+        width=camera.width,
+        height=camera.height,
+        K=K.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
     )
 
 
-def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.PointCloud:
     """Each point as three 32-bit floats and four bytes of colour."""
-    count = len(points.positions)
-    packed = np.zeros(count, np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
+    packed = np.zeros(len(points.positions), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
     packed["position"] = points.positions
     packed["color"] = (*_GREY, 255)
     if points.colors is not None:
@@ -250,34 +245,29 @@ def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> 
     fields = [fox.PackedElementField(name=name, offset=4 * k, type=number) for k, name in enumerate("xyz")]
     channels = enumerate(("red", "green", "blue", "alpha"))
     fields += [fox.PackedElementField(name=name, offset=12 + k, type=byte) for k, name in channels]
-    yield (
-        f"/{path}",
-        fox.PointCloud(
-            timestamp=stamp,
-            frame_id=frame,
-            pose=_still(),
-            point_stride=packed.itemsize,
-            fields=fields,
-            data=packed.tobytes(),
-        ),
+    return fox.PointCloud(
+        timestamp=stamp,
+        frame_id=frame,
+        pose=_still(),
+        point_stride=packed.itemsize,
+        fields=fields,
+        data=packed.tobytes(),
     )
 
 
-def _transform(place: d.Transform, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    x, y, z, w = Rotation.from_matrix(place.T[:3, :3]).as_quat().tolist()
-    yield (
-        "/tf",
-        fox.FrameTransform(
-            timestamp=stamp,
-            parent_frame_id=frame,
-            child_frame_id=path,
-            translation=_vector(place.T[:3, 3].tolist()),
-            rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
-        ),
+def _transform(place: d.Transform, path: str, frame: str, stamp: fox.Timestamp) -> fox.FrameTransform:
+    x, y, z = place.T[:3, 3].tolist()
+    i, j, k, w = Rotation.from_matrix(place.T[:3, :3]).as_quat().tolist()
+    return fox.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id=frame,
+        child_frame_id=path,
+        translation=fox.Vector3(x=x, y=y, z=z),
+        rotation=fox.Quaternion(x=i, y=j, z=k, w=w),
     )
 
 
-def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.SceneUpdate:
     several = None if mesh.colors is None or isinstance(mesh.colors, tuple) else mesh.colors
     triangles = fox.TriangleListPrimitive(
         pose=_still(),
@@ -286,10 +276,10 @@ def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterat
         colors=None if several is None else [_color(color) for color in several.tolist()],
         indices=mesh.faces.ravel().tolist(),
     )
-    yield _entity(path, frame, stamp, triangles=[triangles])
+    return _entity(path, frame, stamp, triangles=[triangles])
 
 
-def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.SceneUpdate:
     strips = [
         fox.LinePrimitive(
             type=fox.LinePrimitiveLineType.LineStrip,
@@ -300,40 +290,35 @@ def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> Ite
         )
         for strip in lines.strips
     ]
-    yield _entity(path, frame, stamp, lines=strips)
+    return _entity(path, frame, stamp, lines=strips)
 
 
-def _entity(path: str, frame: str, stamp: fox.Timestamp, **shapes: Any) -> Written:
+def _entity(path: str, frame: str, stamp: fox.Timestamp, **shapes: Any) -> fox.SceneUpdate:
     entity = fox.SceneEntity(timestamp=stamp, frame_id=frame, id=path, frame_locked=True, **shapes)
-    return SCENE, fox.SceneUpdate(entities=[entity])
+    return fox.SceneUpdate(entities=[entity])
 
 
-def _text(text: d.Text, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    yield f"/{path}", fox.Log(timestamp=stamp, level=fox.LogLevel.Info, name=path, message=text.markdown)
+def _text(text: d.Text, path: str, frame: str, stamp: fox.Timestamp) -> fox.Log:
+    return fox.Log(timestamp=stamp, level=fox.LogLevel.Info, name=path, message=text.markdown)
 
 
 def _log_line(line: LogLine) -> fox.Log:
-    levels: dict[Level, Any] = {
-        "debug": fox.LogLevel.Debug,
-        "info": fox.LogLevel.Info,
-        "warning": fox.LogLevel.Warning,
-        "error": fox.LogLevel.Error,
-    }
+    level = getattr(fox.LogLevel, line.level.capitalize())
     name = f"{line.stage}.{line.replica}" if line.replica else line.stage
-    return fox.Log(timestamp=_stamp(line.time_ns), level=levels[line.level], name=name, message=line.text)
+    return fox.Log(timestamp=_stamp(line.time_ns), level=level, name=name, message=line.text)
 
 
-def _graph(graph: d.Graph, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
+def _graph(graph: d.Graph, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
     nodes = [{"name": name, "label": label} for name, label in zip(graph.nodes, graph.labels, strict=True)]
-    yield f"/{path}", {"nodes": nodes, "edges": [list(edge) for edge in graph.edges]}
+    return {"nodes": nodes, "edges": [list(edge) for edge in graph.edges]}
 
 
-def _scalar(scalar: d.Scalar, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    yield f"/{path}", {"name": scalar.name or path.rpartition("/")[2], "value": scalar.value}
+def _scalar(scalar: d.Scalar, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
+    return {"name": scalar.name or path.rpartition("/")[2], "value": scalar.value}
 
 
-def _bars(bars: d.BarChart, path: str, frame: str, stamp: fox.Timestamp) -> Iterator[Written]:
-    yield f"/{path}", {"values": np.asarray(bars.values, np.float64).tolist()}
+def _bars(bars: d.BarChart, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
+    return {"values": np.asarray(bars.values, np.float64).tolist()}
 
 
 def _color(color: Sequence[int]) -> fox.Color:
@@ -341,24 +326,18 @@ def _color(color: Sequence[int]) -> fox.Color:
     return fox.Color(r=red, g=green, b=blue, a=1.0)
 
 
-def _point2(x: float, y: float) -> fox.Point2:
-    return fox.Point2(x=x, y=y)
-
-
-def _vector(point: Sequence[float]) -> fox.Vector3:
-    return fox.Vector3(x=point[0], y=point[1], z=point[2])
-
-
 def _still() -> fox.Pose:
     """The identity."""
-    return fox.Pose(position=_vector((0.0, 0.0, 0.0)), orientation=fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+    return fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 
 
 def _points3(points: d.Floats) -> list[fox.Point3]:
     return [fox.Point3(x=x, y=y, z=z) for x, y, z in np.asarray(points, np.float64).tolist()]
 
 
-_MAPPINGS: dict[type, Callable[[Any, str, str, Any], Iterator[Written]]] = {
+_TOPICS: dict[type, str] = {d.Transform: "/tf", d.Mesh3D: SCENE, d.Lines3D: SCENE}
+"""Of drawings whose messages say themselves where they belong; others have the topic of their path."""
+_MESSAGES: dict[type, Callable[[Any, str, str, Any], Any]] = {
     d.Image: _image,
     d.DepthImage: _depth,
     d.Boxes2D: _boxes,
@@ -372,3 +351,4 @@ _MAPPINGS: dict[type, Callable[[Any, str, str, Any], Iterator[Written]]] = {
     d.Scalar: _scalar,
     d.BarChart: _bars,
 }
+"""By drawing: makes a Foxglove message, or a dict, of it, its path, its frame and the time."""

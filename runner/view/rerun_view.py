@@ -21,13 +21,12 @@ import rerun_cli
 from mcap.records import Metadata
 
 from runner.contract import Refused
-from runner.graph.graph import Graph, graph_from_json
+from runner.graph.graph import graph_from_json
 from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
 from runner.recording.recording import RUN, Recording, payload_kind
 from runner.view.canvas import Canvas
-from runner.view.drawing import Views
 from runner.view.views import drawn, load_views
 
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
@@ -43,11 +42,11 @@ SCREENSHOT_SECONDS = 120
 class Show:
     """Draws the messages of one graph onto a Rerun stream, with the views the graph names."""
 
-    def __init__(self, graph: Graph, views: Views, stream: rr.RecordingStream) -> None:
-        self._graph = graph
-        self._views = views
-        self._canvas = Canvas(stream)
-        self._canvas.start(views.layout(), views.static())
+    def __init__(self, graph_json: str, path: Path, stream: rr.RecordingStream) -> None:
+        """``path`` is the recording's. Raises Refused where the graph has no views."""
+        self._graph = graph_from_json(graph_json, str(path))
+        self._views = load_views(self._graph)
+        self._canvas = Canvas(stream, self._views)
 
     def draw(self, sealed: Envelope) -> None:
         """Draws one message; what cannot be drawn is named on stderr and left out."""
@@ -73,16 +72,11 @@ def save_rrd(recording: Recording, target: Path) -> None:
     """Draws a whole recording into a Rerun file."""
     stream = _stream(recording.path)
     stream.save(target)
-    show = _show(recording.run["graph"], recording.path, stream)
+    show = Show(recording.run["graph"], recording.path, stream)
     for sealed in recording.envelopes():
         show.draw(sealed)
     stream.flush()
     stream.disconnect()
-
-
-def _show(graph_json: str, path: Path, stream: rr.RecordingStream) -> Show:
-    graph = graph_from_json(graph_json, str(path))
-    return Show(graph, load_views(graph), stream)
 
 
 def _stream(path: Path) -> rr.RecordingStream:
@@ -92,9 +86,9 @@ def _stream(path: Path) -> rr.RecordingStream:
 # ------------------------------------------------------------------------------------ live
 
 
-def view_live(path: Path | None = None, *, folder: Path = Path("recordings")) -> None:
-    """Shows a graph while it runs: ``path`` is its recording, by default the one in ``folder`` being written."""
-    path = path or newest_live(folder)
+def view_live(path: Path | None = None) -> None:
+    """Shows a graph while it runs: ``path`` is its recording, by default the one in ``recordings`` being written."""
+    path = path or newest_live(Path("recordings"))
     # The graph comes first: drawing, and the viewer that this starts, take what it leaves of the cores.
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     port = _free_port()
@@ -122,16 +116,11 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
     with open_file(path) as file:
         for record in Container(Growing(file, stopped), str(path)):
             if isinstance(record, Metadata) and record.name == RUN:
-                show = _show(record.metadata["graph"], path, stream)
-            elif isinstance(record, Entry) and show is not None:
-                _draw_entry(show, record)
+                show = Show(record.metadata["graph"], path, stream)
+            elif isinstance(record, Entry) and payload_kind(record.topic) is Envelope and show is not None:
+                with contextlib.suppress(CodecError):
+                    show.draw(unpack(Envelope, record.message.data))
     stream.flush()
-
-
-def _draw_entry(show: Show, entry: Entry) -> None:
-    if payload_kind(entry.topic) is Envelope:
-        with contextlib.suppress(CodecError):
-            show.draw(unpack(Envelope, entry.message.data))
 
 
 # ------------------------------------------------------------------------------------ the viewer's process
@@ -140,16 +129,13 @@ def _draw_entry(show: Show, entry: Entry) -> None:
 def _start_viewer(port: int, *arguments: str) -> subprocess.Popen[bytes]:
     """A window where there is a display, a page on loopback elsewhere; takes drawings on ``port``."""
     command = [RERUN, "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, *arguments]
-    if not _has_display():
+    display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not display:
         web = _free_port()
         command += ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", MEMORY]
         source = quote(f"rerun+http://127.0.0.1:{port}/proxy", safe="")
         print(f"viewer: http://127.0.0.1:{web}/?url={source} (Ctrl-C closes it)", flush=True)
     return subprocess.Popen(bound(command), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-def _has_display() -> bool:
-    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _wait(viewer: subprocess.Popen[bytes]) -> None:

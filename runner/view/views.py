@@ -25,8 +25,7 @@ def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
     id = MessageId.of(sealed.id)
     found: list[Drawing] = []
     try:
-        kind = graph.outputs_of(id.stage).get(id.port)
-        if kind is not None:
+        if (kind := graph.outputs_of(id.stage).get(id.port)) is not None:
             found.extend(views.draw(open_envelope(kind, sealed)))
     except Exception as error:  # the rest of the recording is still worth seeing
         reason = str(error).partition("\n")[0]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from runner.cli.main import main
 from runner.contract import Refused
 from runner.graph.graph import load_graph
-from runner.inspect.causes import Causes, path_to, tree
+from runner.inspect.causes import Causes, tree
 from runner.inspect.info import Durations, StageTimes
 from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
@@ -83,7 +83,7 @@ def test_without_a_journal_the_causes_in_the_header_are_shown(tmp_path: Path):
 def test_the_critical_path_goes_through_what_came_last(toys: Path):
     recording = Recording(toys)
     causes = Causes(recording)
-    path = path_to(recording, causes, "gatherer.total#1")
+    path = causes.path_to("gatherer.total#1")
     assert path == ["counter.number#1", "splitter.piece#7", "worker.answer#7", "gatherer.total#1"]
     (last,) = (found for found in critical_paths(recording, causes) if found.last == "sink.finished#0")
     assert [hop.stage for hop in last.hops] == ["splitter", "worker", "gatherer", "sink"]

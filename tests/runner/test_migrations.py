@@ -12,7 +12,7 @@ from runner.message.codec import CodecError, Envelope, decode_untyped, open_enve
 from runner.recording.migrations import migrated, without_gained_fields
 from runner.recording.recording import Recording
 from tests.runner.recordings import rewrite
-from tests.runner.test_replay import verify
+from tests.runner.test_replay import replay, verify
 from tests.runner.weather import MIGRATIONS, Forecast, Reading
 
 OLD = Path(__file__).with_name("weather-1.mcap")
@@ -32,6 +32,14 @@ def test_an_old_recording_replays():
     code, said = verify(OLD)
     assert code == 0, said
     assert "12" in said
+
+
+def test_what_its_class_has_gained_since_is_no_change():
+    code, said = replay(OLD, "--from", "forecaster")
+    assert code == 0, said
+    assert said.splitlines()[-1] == "NOTHING CHANGES: 12 identical, of 1 stages"
+    _, said = replay(OLD, "--until", "forecaster.forecast#3")
+    assert "executed again: identical to the recording" in said
 
 
 def test_a_changed_value_in_an_old_recording_still_diverges(tmp_path: Path):

@@ -225,4 +225,4 @@ def test_a_run_that_records_steps_only_says_so_and_cannot_be_replayed(tmp_path: 
     assert (len(recording.messages), str(recording.verdict)) == (0, "INCOMPLETE: steps only")
     assert {step.stage for step in recording.steps} == {"counter", "doubler", "sink"}
     with pytest.raises(Refused, match="holds no messages"):
-        verify(done.recording, (), workers=1, say=print)
+        verify(done.recording, (), workers=1)

@@ -1,5 +1,7 @@
 """Changed stages of recordings executed again, as a user types it."""
 
+import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +32,21 @@ class Mute(Gatherer):
         if number.value == 2:
             raise ValueError("no third total")
         return super().on_answers(answers, number)
+
+
+class Leaving(Gatherer):
+    """Its process goes while others work."""
+
+    def on_answers(self, answers: list[Answer], number: Number) -> Total:
+        threading.Timer(0.1, os._exit, (7,)).start()
+        return super().on_answers(answers, number)
+
+
+class Closing(Gatherer):
+    """Says that it was closed."""
+
+    def close(self) -> None:
+        Path(os.environ["CLOSED"]).touch()
 
 
 class Sum:
@@ -106,6 +123,20 @@ def test_what_a_handler_raises_is_named_and_its_message_vanishes(toys: Path):
     assert code == 1
     assert "FAILED gatherer.on_answers of counter.number#2: ValueError: no third total" in said
     assert "vanished: gatherer.total#4" in said
+
+
+def test_a_process_that_has_gone_between_two_steps_is_named(toys: Path):
+    swap = ("--swap", "gatherer=tests.runner.test_whatif:Leaving")
+    code, said = replay(toys, *swap, "--set", "worker.seconds=0.1", "--workers", "1")
+    assert code == 2
+    assert "gatherer.on_answers of counter.number#1: its process ended with exit code 7" in said
+
+
+def test_stages_are_closed_at_the_end(toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("CLOSED", str(tmp_path / "closed"))
+    code, said = replay(toys, "--swap", "gatherer=tests.runner.test_whatif:Closing")
+    assert code == 0, said
+    assert (tmp_path / "closed").exists()
 
 
 def test_another_seed_executes_everything(toys: Path):

@@ -10,8 +10,8 @@ from typing import Any
 
 Commands = Any
 """What argparse returns from ``add_subparsers``; it has no public type."""
-Command = Callable[[argparse.Namespace], int]
-"""Runs with the parsed options and returns the exit status."""
+Command = Callable[[argparse.Namespace], int | None]
+"""Runs with the parsed options and returns the exit status; None is 0."""
 
 
 def add(commands: Commands, name: str, command: Command, text: str) -> argparse.ArgumentParser:
@@ -23,9 +23,8 @@ def add(commands: Commands, name: str, command: Command, text: str) -> argparse.
 
 def add_graph(parser: argparse.ArgumentParser) -> None:
     """Adds a graph file and the settings that change it."""
-    parser.add_argument(
-        "graph", type=graph_file, metavar="GRAPH", help="a graph file, or the name of one that a package brings"
-    )
+    text = "a graph file, or the name of one that a package brings"
+    parser.add_argument("graph", type=graph_file, metavar="GRAPH", help=text)
     add_settings(parser)
 
 
@@ -41,14 +40,19 @@ def add_file(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
 
 
-def count(text: str) -> int:
-    """Reads a number of things, for argparse."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
-    return int(text)
+def add_recordings(parser: argparse.ArgumentParser, text: str) -> None:
+    """Adds the folder of recordings; ``text`` says what for."""
+    parser.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help=text)
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Adds ``--set``, as ``settings``."""
     text = "change a setting, for example camera.dataset=DIR; may be given again"
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", dest="settings", help=text)
+
+
+def count(text: str) -> int:
+    """Reads a number of things, for argparse."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be 1 or more")
+    return int(text)

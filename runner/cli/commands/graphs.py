@@ -1,11 +1,16 @@
 """Commands on graph files: ``up``, ``check``, ``graph``, ``schema``."""
 
+from __future__ import annotations
+
 import argparse
 import gc
 import json
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from runner.cli.commands import Commands, add, add_graph
+from runner.cli.commands import Commands, add, add_graph, add_recordings
+
+if TYPE_CHECKING:
+    from runner.graph.document import Document
 
 
 def add_commands(commands: Commands) -> None:
@@ -16,7 +21,7 @@ def add_commands(commands: Commands) -> None:
     where = up.add_mutually_exclusive_group()
     where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
-    up.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go")
+    add_recordings(up, "where recordings go")
     seen = up.add_mutually_exclusive_group()
     seen.add_argument("--view", action="store_true", help="open the viewer")
     seen.add_argument("--steps-only", action="store_true", help="record no messages: nothing can be replayed")
@@ -26,21 +31,25 @@ def add_commands(commands: Commands) -> None:
 
 
 def _up(options: argparse.Namespace) -> int:
+    from runner.graph.document import read_document
     from runner.process.forks import become_clean
     from runner.view.views import require_viewer
 
     if options.view:
         require_viewer()
     seed = [] if options.seed is None else [f"seed={options.seed}"]
-    settings = (*options.settings, *seed)
-    host = None if options.here else _chosen_host(options.graph, settings, options.host)
+    options.settings = (*options.settings, *seed)
+    document = read_document(options.graph)
+    for setting in options.settings:
+        document.set(setting)
+    host = None if options.here else _other_host(options, document)
     if host is not None:
-        return _take_part(options, settings, host)
+        return _take_part(options, document, host)
     become_clean("runner.cli", *options.arguments)
-    return _supervise(options, settings)
+    return _supervise(options)
 
 
-def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
+def _supervise(options: argparse.Namespace) -> int:
     """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
     from runner.graph.graph import SUPERVISOR, load_graph
     from runner.process.fork_server import ForkServer
@@ -49,13 +58,13 @@ def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
 
     terminal = Terminal()
     gc.disable()  # until it forks: what is imported stays
-    graph = load_graph(options.graph, settings)
+    graph = load_graph(options.graph, options.settings)
     forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
         graph.here() if options.here else graph,
         file=options.graph,
         recordings=options.recordings,
-        settings=settings,
+        settings=options.settings,
         terminal=terminal,
         forks=forks,
         steps_only=options.steps_only,
@@ -65,30 +74,22 @@ def _supervise(options: argparse.Namespace, settings: tuple[str, ...]) -> int:
     return end.code
 
 
-def _chosen_host(file: Path, settings: tuple[str, ...], name: str | None) -> str | None:
+def _other_host(options: argparse.Namespace, document: Document) -> str | None:
     """The host that this machine is, None where it has the supervisor; raises Refused where that is not clear."""
-    from runner.graph.document import read_document
     from runner.graph.placement import choose_host, read_layout
 
-    document = read_document(file)
-    for setting in settings:
-        document.set(setting)
     layout = read_layout(document)
-    chosen = choose_host(layout, name, file)
+    chosen = choose_host(layout, options.host, options.graph)
     return None if not layout.hosts or chosen == layout.head.name else chosen
 
 
-def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str) -> int:
-    from runner.graph.document import read_document
+def _take_part(options: argparse.Namespace, document: Document, host: str) -> int:
     from runner.hosts.agent import Agent, refuse_settings
     from runner.process.fork_server import ForkServer
     from runner.process.forks import become_clean
     from runner.terminal import Terminal
 
-    document = read_document(options.graph)
-    refuse_settings(settings, host)
-    for setting in settings:
-        document.set(setting)
+    refuse_settings(options.settings, host)
     become_clean("runner.cli", *options.arguments)
     terminal = Terminal()
     forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
@@ -97,7 +98,7 @@ def _take_part(options: argparse.Namespace, settings: tuple[str, ...], host: str
     return end.code
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check(options: argparse.Namespace) -> None:
     from runner.graph.graph import load_graph
 
     graph = load_graph(options.graph, options.settings)
@@ -105,18 +106,15 @@ def _check(options: argparse.Namespace) -> int:
     edges = sum(len(node.inputs) for node in graph.nodes.values()) - commands
     counts = (f"{len(graph.nodes)} stages", f"{len(graph.processes())} processes", f"{edges} edges")
     print(f"{options.graph}: {', '.join(counts)}{f', {commands} commands' if commands else ''}: good")
-    return 0
 
 
-def _graph(options: argparse.Namespace) -> int:
+def _graph(options: argparse.Namespace) -> None:
     from runner.graph.graph import load_graph, mermaid
 
     print(mermaid(load_graph(options.graph, options.settings)))
-    return 0
 
 
-def _schema(_: argparse.Namespace) -> int:
+def _schema(_: argparse.Namespace) -> None:
     from runner.graph.graph import graph_schema
 
     print(json.dumps(graph_schema(), indent=2))
-    return 0

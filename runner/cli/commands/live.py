@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.cli import completion
-from runner.cli.commands import Commands, add, count
+from runner.cli.commands import Commands, add, add_recordings, count
 from runner.cli.completion import completed
 from runner.contract import Refused
 
@@ -19,19 +19,45 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Adds the commands of this group."""
     _add_run(add(commands, "ps", _ps, "show the graphs that run and how each of their processes is"))
-    _add_logs(commands)
-    _add_topic(commands)
+
+    logs = add(commands, "logs", _logs, "show what the stages of the running graph say, or of the last one")
+    text = "only this one, with what its processes printed"
+    completed(logs.add_argument("stage", metavar="STAGE", nargs="?", help=text), completion.stages)
+    logs.add_argument("-f", "--follow", action="store_true", help="go on until the graph ends")
+    add_recordings(logs, "where the last run is")
+    _add_run(logs)
+
+    topic = commands.add_parser("topic", help="look at what flows", description="Look at what flows.")
+    _add_verbs(topic.add_subparsers(required=True, metavar="VERB"))
+
     call = add(commands, "call", _call, "have a stage do what it can be asked, and wait until it is done")
-    stage = call.add_argument("stage", metavar="STAGE", nargs="?", help="without a command: lists what it can be asked")
-    completed(stage, completion.callable_stages)
+    text = "without a command: lists what it can be asked"
+    completed(call.add_argument("stage", metavar="STAGE", nargs="?", help=text), completion.callable_stages)
     completed(call.add_argument("name", metavar="COMMAND", nargs="?"), completion.command_names)
     fields = call.add_argument("fields", metavar="FIELD=VALUE", nargs="*", help="for example name=breakfast")
     completed(fields, completion.fields)
     _add_run(call)
+
     restart = add(commands, "restart", _restart, "replace a process in order: it finishes its step, nothing is lost")
     completed(restart.add_argument("process", metavar="STAGE[.REPLICA]"), completion.processes)
     _add_run(restart)
+
     _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
+
+
+def _add_verbs(verbs: Commands) -> None:
+    """What can be done with topics."""
+    _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
+    for name, verb, text, unit in (
+        ("echo", _topic_echo, "print messages as they come, whatever their type", "messages"),
+        ("hz", _topic_rate, "how often messages come, from their headers alone", "lines, one a second"),
+        ("bw", _topic_rate, "how many bytes flow, from their headers alone", "lines, one a second"),
+    ):
+        parser = add(verbs, name, verb, text)
+        parser.set_defaults(verb=name)
+        completed(parser.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
+        parser.add_argument("-n", type=count, metavar="N", dest="count", help=f"end after so many {unit}")
+        _add_run(parser)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -39,36 +65,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     completed(parser.add_argument("--run", metavar="NAME", help=text), completion.run_names)
 
 
-def _add_logs(commands: Commands) -> None:
-    logs = add(commands, "logs", _logs, "show what the stages of the running graph say, or of the last one")
-    stage = logs.add_argument(
-        "stage", metavar="STAGE", nargs="?", help="only this one, with what its processes printed"
-    )
-    completed(stage, completion.stages)
-    logs.add_argument("-f", "--follow", action="store_true", help="go on until the graph ends")
-    logs.add_argument(
-        "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where the last run is"
-    )
-    _add_run(logs)
-
-
-def _add_topic(commands: Commands) -> None:
-    topic = commands.add_parser("topic", help="look at what flows", description="Look at what flows.")
-    verbs = topic.add_subparsers(required=True, metavar="VERB")
-    _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
-    echo = add(verbs, "echo", _topic_echo, "print messages as they come, whatever their type")
-    completed(echo.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
-    echo.add_argument("-n", type=count, metavar="N", dest="count", help="end after so many messages")
-    _add_run(echo)
-    for name, text in (("hz", "how often messages come"), ("bw", "how many bytes flow")):
-        measure = add(verbs, name, _topic_rate, f"{text}, from their headers alone")
-        completed(measure.add_argument("topic", metavar="STAGE/PORT"), completion.topics)
-        measure.add_argument("-n", type=count, metavar="N", dest="count", help="end after so many lines, one a second")
-        measure.set_defaults(measure=name)
-        _add_run(measure)
-
-
-def _ps(options: argparse.Namespace) -> int:
+def _ps(options: argparse.Namespace) -> None:
     from runner.live.live import Live
     from runner.live.tables import status_text
     from runner.supervise.registry import find_run, runs
@@ -83,10 +80,9 @@ def _ps(options: argparse.Namespace) -> int:
         print("\n" * (number > 0) + text)
     if not entries:
         print("no graph is running on this machine")
-    return 0
 
 
-def _logs(options: argparse.Namespace) -> int:
+def _logs(options: argparse.Namespace) -> None:
     from runner.inspect.logs import log_lines, newest_recording, printed_lines
     from runner.live.tables import show_lines
     from runner.supervise.registry import find_run, runs
@@ -97,44 +93,40 @@ def _logs(options: argparse.Namespace) -> int:
     if options.stage and not options.follow:
         for process, line in printed_lines(path, options.stage):
             print(f"{process} | {line}")
-    return 0
 
 
-def _topic_list(options: argparse.Namespace) -> int:
+def _topic_list(options: argparse.Namespace) -> None:
     from runner.live.tables import topics_text
 
     with _reached(options) as live:
         print(topics_text(live.status()))
-    return 0
 
 
-def _topic_echo(options: argparse.Namespace) -> int:
+def _topic_echo(options: argparse.Namespace) -> None:
     from runner.inspect.echo import lines_of
 
     with _reached(options) as live:
         for packet in islice(live.messages(options.topic), options.count):
             print("\n".join(lines_of(packet.payload)), flush=True)
-    return 0
 
 
-def _topic_rate(options: argparse.Namespace) -> int:
+def _topic_rate(options: argparse.Namespace) -> None:
     from runner.live.tables import bandwidth_text, rate_text
 
-    text = rate_text if options.measure == "hz" else bandwidth_text
+    text = rate_text if options.verb == "hz" else bandwidth_text
     with _reached(options) as live:
         for headers in islice(live.headers(options.topic), options.count):
             print(text(headers), flush=True)
-    return 0
 
 
-def _call(options: argparse.Namespace) -> int:
+def _call(options: argparse.Namespace) -> int | None:
     from runner.live.tables import commands_text, show_progress
     from runner.supervise.calls import CallRequest
 
     with _reached(options) as live:
         if options.name is None:
             print(commands_text(live.commands(), options.stage))
-            return 0
+            return None
         live.wait_until_ready(print)
         request = CallRequest(options.stage, options.name, dict(map(_field, options.fields)))
         id = live.call(request)
@@ -148,13 +140,12 @@ def _field(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _restart(options: argparse.Namespace) -> int:
+def _restart(options: argparse.Namespace) -> None:
     with _reached(options) as live:
         print(live.restart(options.process))
-    return 0
 
 
-def _down(options: argparse.Namespace) -> int:
+def _down(options: argparse.Namespace) -> None:
     from runner.live.live import wait_until_gone
     from runner.live.tables import from_here
 
@@ -162,7 +153,6 @@ def _down(options: argparse.Namespace) -> int:
         live.down()
     wait_until_gone(live.entry)
     print(f"{live.entry.run} has ended; recording {from_here(live.entry.recording)}")
-    return 0
 
 
 def _reached(options: argparse.Namespace) -> Live:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from runner.cli.commands import Commands, add, graph_file
-from runner.cli.completion import SHELLS
+from runner.cli.commands import Commands, add, add_recordings, graph_file
+from runner.cli.completion import SHELLS, script
 
 
 def add_commands(commands: Commands) -> None:
@@ -14,9 +13,7 @@ def add_commands(commands: Commands) -> None:
     doctor = add(commands, "doctor", _doctor, "say what would keep a graph from running here, and what to type")
     text = "also whether this graph could start, and what its stages need of the machine"
     doctor.add_argument("graph", type=graph_file, metavar="GRAPH", nargs="?", help=text)
-    doctor.add_argument(
-        "--recordings", type=Path, default=Path("recordings"), metavar="DIR", help="where recordings go"
-    )
+    add_recordings(doctor, "where recordings go")
     shell = add(commands, "completion", _completion, "print what makes a shell complete this command")
     shell.add_argument("shell", choices=SHELLS)
 
@@ -33,8 +30,5 @@ def _doctor(options: argparse.Namespace) -> int:
     return int(bad > 0)
 
 
-def _completion(options: argparse.Namespace) -> int:
-    from runner.cli.completion import script
-
+def _completion(options: argparse.Namespace) -> None:
     print(script(options.shell))
-    return 0

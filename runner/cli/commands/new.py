@@ -12,10 +12,9 @@ def add_commands(commands: Commands) -> None:
     new.add_argument("name", metavar="NAME", help="of the project, its folder and its Python package")
 
 
-def _new(options: argparse.Namespace) -> int:
+def _new(options: argparse.Namespace) -> None:
     from runner.cli.project import new_project
 
     for path in new_project(options.name, Path.cwd()):
         print(path.relative_to(Path.cwd()))
     print(f"now: cd {options.name} && runner up graph.yaml && pytest")
-    return 0

@@ -3,65 +3,48 @@
 import argparse
 from pathlib import Path
 
-from runner.cli.commands import Commands, add, add_file
+from runner.cli.commands import Commands, add, add_file, add_recordings
 from runner.contract import Refused
 
 
 def add_commands(commands: Commands) -> None:
     """Adds the commands of this group."""
     add_file(add(commands, "info", _info, "say what a recording holds and whether it is complete"))
-    _add_view(commands)
-    _add_recover(commands)
-    _add_why(commands)
-    add_file(add(commands, "latency", _latency, "say how long messages queue, travel and are worked on"))
-    _add_diff(commands)
-    _add_export(commands)
 
-
-def _add_view(commands: Commands) -> None:
     view = add(commands, "view", _view, "show a recording, or a graph while it runs")
     view.add_argument("file", type=Path, metavar="FILE", nargs="?", help="a recording")
     view.add_argument("--live", action="store_true", help="follow the run that is being recorded")
     view.add_argument("--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening the viewer")
     view.add_argument("--png", type=Path, metavar="PNG", help="write a picture instead of opening the viewer")
 
-
-def _add_recover(commands: Commands) -> None:
-    text = "write what a torn or damaged recording holds as a clean one"
-    recover = add(commands, "recover", _recover, text)
+    recover = add(commands, "recover", _recover, "write what a torn or damaged recording holds as a clean one")
     add_file(recover)
     recover.add_argument("out", type=Path, metavar="OUT", nargs="?", help="by default FILE.recovered.mcap")
 
-
-def _add_why(commands: Commands) -> None:
     why = add(commands, "why", _why, "print the tree of causes of a message, with what each hop cost")
     why.add_argument("id", metavar="ID", help="a message, for example ranker.scene_estimate#0")
     why.add_argument("file", type=Path, metavar="FILE", nargs="?", help="a recording; the newest by default")
-    folder = "where the newest is looked for"
-    why.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help=folder)
+    add_recordings(why, "where the newest is looked for")
 
+    add_file(add(commands, "latency", _latency, "say how long messages queue, travel and are worked on"))
 
-def _add_diff(commands: Commands) -> None:
     diff = add(commands, "diff", _diff, "say where two recordings differ first, and how each field differs")
     for name in ("a", "b"):
         diff.add_argument(name, type=Path, metavar=name.upper(), help="a recording")
 
-
-def _add_export(commands: Commands) -> None:
     export = add(commands, "export", _export, "write what a recording shows in the format of another tool")
     add_file(export)
     text = "an MCAP file of Foxglove messages: images, cameras, point clouds, transforms, scenes and logs"
     export.add_argument("--foxglove", type=Path, metavar="OUT", required=True, help=text)
 
 
-def _info(options: argparse.Namespace) -> int:
+def _info(options: argparse.Namespace) -> None:
     from runner.inspect.info import describe
 
     print(describe(options.file))
-    return 0
 
 
-def _view(options: argparse.Namespace) -> int:
+def _view(options: argparse.Namespace) -> None:
     from runner.view.views import require_viewer
 
     require_viewer()
@@ -73,33 +56,28 @@ def _view(options: argparse.Namespace) -> int:
         raise Refused("runner view: name a recording, or --live")
     else:
         view_recording(options.file, save=options.save, png=options.png)
-    return 0
 
 
-def _recover(options: argparse.Namespace) -> int:
+def _recover(options: argparse.Namespace) -> None:
     from runner.recording.recover import recover
 
     recording, target = recover(options.file, options.out)
     print(f"{options.file}: {recording.verdict}")
     print(f"{target}: {len(recording.messages)} messages, {len(recording.steps)} steps, {len(recording.log)} log lines")
-    return 0
 
 
-def _why(options: argparse.Namespace) -> int:
+def _why(options: argparse.Namespace) -> None:
     from runner.inspect.causes import tree
     from runner.inspect.logs import newest_recording
     from runner.recording.recording import Recording
 
     print(*tree(Recording(options.file or newest_recording(options.recordings)), options.id), sep="\n")
-    return 0
 
 
-def _latency(options: argparse.Namespace) -> int:
+def _latency(options: argparse.Namespace) -> None:
     from runner.inspect.latency import latency
 
-    for line in latency(options.file):
-        print(line)
-    return 0
+    print(*latency(options.file), sep="\n")
 
 
 def _diff(options: argparse.Namespace) -> int:
@@ -108,11 +86,9 @@ def _diff(options: argparse.Namespace) -> int:
     return diff(options.a, options.b)
 
 
-def _export(options: argparse.Namespace) -> int:
+def _export(options: argparse.Namespace) -> None:
     from runner.view.export import export
 
     if options.foxglove.suffix != ".mcap":
         raise Refused(f"--foxglove {options.foxglove}: must end in .mcap")
-    for line in export(options.file, options.foxglove):
-        print(line)
-    return 0
+    print(*export(options.file, options.foxglove), sep="\n")

@@ -26,20 +26,15 @@ def add_commands(commands: Commands) -> None:
     replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
     replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
     replay.add_argument("--workers", type=count, metavar="N", help="stages executed at the same time (one a core)")
-    _add_travel(replay)
-
-
-def _add_travel(replay: argparse.ArgumentParser) -> None:
     replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
     text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.winner > 0'"
     replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
-    replay.add_argument(
-        "--step", action="store_true", help="go from message to message (Enter), from there or the start"
-    )
+    text = "go from message to message (Enter), from there or the start"
+    replay.add_argument("--step", action="store_true", help=text)
     replay.add_argument("--prompt", action="store_true", help="open a Python prompt where it stops, terminal or not")
 
 
-def _replay(options: argparse.Namespace) -> int:
+def _replay(options: argparse.Namespace) -> int | None:
     """Only saying what would be executed needs no clean process."""
     if options.until or options.condition or options.step:
         return _in_clean_process(options, _travel)
@@ -49,10 +44,11 @@ def _replay(options: argparse.Namespace) -> int:
         return _in_clean_process(options, _verify)
     from runner.replay.replay import plan
 
-    return plan(options.file, print)
+    print(*plan(options.file), sep="\n")
+    return None
 
 
-def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
+def _in_clean_process(options: argparse.Namespace, command: Command) -> int | None:
     """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
     from runner.process.children import PARENT, die_with_parent
     from runner.process.forks import call_clean, is_clean
@@ -67,7 +63,7 @@ def _in_clean_process(options: argparse.Namespace, command: Command) -> int:
 def _verify(options: argparse.Namespace) -> int:
     from runner.replay.replay import verify
 
-    return verify(options.file, options.settings, workers=options.workers, say=print)
+    return verify(options.file, options.settings, workers=options.workers)
 
 
 def _what_if(options: argparse.Namespace) -> int:
@@ -81,7 +77,6 @@ def _what_if(options: argparse.Namespace) -> int:
         swaps=options.swaps,
         origins=options.origins,
         workers=options.workers,
-        say=print,
     )
 
 
@@ -94,7 +89,7 @@ def _travel(options: argparse.Namespace) -> int:
         raise Refused("--until and --break each say where to stop; give one")
     return travel(
         options.file,
-        assignments=[*options.settings],
+        assignments=options.settings,
         swaps=options.swaps,
         until=options.until,
         condition=options.condition,
