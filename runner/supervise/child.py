@@ -28,10 +28,6 @@ class Child:
     process: Process
     handle: Handle
     log: Path
-    started: float = field(default_factory=time.monotonic)
-    announced: bool = False
-    ready_after: float = 0.0
-    """Seconds from its start."""
     crashes: int = 0
     """How often this process has crashed before, whatever else it was restarted for."""
     restarted_because: str = ""

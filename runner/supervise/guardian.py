@@ -19,7 +19,6 @@ from runner.supervise.child import Child, Progress, end_all, signal_all, wait_fo
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Rates
 from runner.terminal import Terminal
-from runner.transport.bus import Presence
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
@@ -79,7 +78,6 @@ class Guardian:
         self._recorder: Child | None = None
         self._viewer: Child | None = None
         self._progress = {stage: Progress(_shared(run.graph, stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
-        self._presence = Presence()
         self._pulses = Pulses()
         self._rates = Rates()
         self._settled: set[Process] = set()
@@ -88,15 +86,23 @@ class Guardian:
         """Those that publish no messages any more."""
         self._ended: set[Process] = set()
         """Those that have journalled their end."""
-        self._absent = set(run.graph.processes())
-        self._was_ready = False
+        self._started: dict[Process, float] = {}
+        """When each was begun to be started, monotonic seconds: it may be there before that has come to its end."""
+        self._ready: dict[Process, float] = {}
+        """Seconds from its start until it was there, of those that have been."""
 
     # ------------------------------------------------------------------------------------------ from start to end
 
     def start_recorder(self, *, view: bool) -> None:
         """Starts the recorder and, once that is there, the viewer if wanted."""
-        self._recorder = self._launch.recorder()
-        if view and self._presence.wait_for([(RECORDER, 0)], self._recorder_died):
+        process = Process(RECORDER, 0)
+        self._started[process] = time.monotonic()
+        self._recorder = self._launch.recorder(process)
+        while view and process not in self._ready:
+            if self._recorder_died():
+                return
+            time.sleep(TICK_SECONDS)
+        if view:
             self._viewer = self._launch.viewer()
             self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
 
@@ -114,7 +120,7 @@ class Guardian:
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
-            elif not child.announced and time.monotonic() < child.dead_since + SEEN_SECONDS:
+            elif child.process not in self._ready and time.monotonic() < child.dead_since + SEEN_SECONDS:
                 child.dead_since = min(child.dead_since, time.monotonic())  # it may have been ready, and not seen yet
             elif child.successor is not None:
                 self._start_successor(child, *child.successor)
@@ -159,7 +165,7 @@ class Guardian:
         """Says that a process has ended without having journalled that."""
         if child.handle.poll() is None or child.reported:
             return
-        if child.handle.returncode == 0 and not child.condemned and child.announced:
+        if child.handle.returncode == 0 and not child.condemned and child.process in self._ready:
             deadline = time.monotonic() + RECORDED_SECONDS
             while child.process not in self._ended and time.monotonic() < deadline:
                 time.sleep(TICK_SECONDS / 5)
@@ -202,35 +208,30 @@ class Guardian:
 
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""
-        self._presence.update(process, present)
-        child = self._children.get((process.stage, process.replica))
         if not present:
+            child = self._children.get((process.stage, process.replica))
             if self._hosts is not None and child is not None and child.process == process:
                 child.unheard_since = time.monotonic()
-            return
-        if self._recorder is not None and process == self._recorder.process:
-            self._recorder.announced = True
-        elif child is not None and child.process == process:
-            child.ready_after = time.monotonic() - child.started
-            child.announced = True
-            self._terminal.show(self._name(process), f"ready after {child.ready_after:.1f} s")
-            self._absent.discard((process.stage, process.replica))
-        else:
-            return
-        self._say_when_all_are_ready()
-
-    def _say_when_all_are_ready(self) -> None:
-        if not self._was_ready and not self.awaited():
-            self._was_ready = True
-            self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
+        elif process in self._started and process not in self._ready:
+            awaited = self.awaited()
+            self._ready[process] = time.monotonic() - self._started[process]
+            if process.stage != RECORDER:
+                self._terminal.show(self._name(process), f"ready after {self._ready[process]:.1f} s")
+            if awaited and not self.awaited():
+                self._terminal.show(SUPERVISOR, f"all {len(self._graph.processes())} processes are ready")
 
     # ------------------------------------------------------------------------------------------ what is asked
 
     def awaited(self) -> list[str]:
         """Names of those who must hear what is published and have never been ready, then the recorder; none: ready."""
-        if absent := list(self._absent):  # which another thread may change
+        if absent := self._absent():
             return sorted(self._run.name_of(*key) for key in absent)
-        return [] if self._presence.wait_for([(RECORDER, 0)], lambda: True) else [RECORDER]
+        return [] if Process(RECORDER, 0) in self._ready else [RECORDER]
+
+    def _absent(self) -> list[tuple[str, int]]:
+        """(stage, replica) of which no process has ever been ready."""
+        ready = {(process.stage, process.replica) for process in list(self._ready)}  # which another thread may change
+        return [key for key in self._graph.processes() if key not in ready]
 
     def restart(self, name: str, ended: Callable[[], bool]) -> str:
         """Asks one process to finish and waits for its successor; returns what to tell the user.
@@ -241,15 +242,15 @@ class Guardian:
         if name not in found:
             raise Refused(f"no process {name!r}{suggest(name, found)}")
         old = self._children.get(found[name])
-        if old is None or not old.announced:
+        if old is None or old.process not in self._ready:
             raise Refused(f"{name} is not ready yet")
         old.retires_by = time.monotonic() + RETIRE_SECONDS
         old.handle.send_signal(signal.SIGUSR1)
-        while (new := self._children[found[name]]) is old or not new.announced:
+        while (new := self._children[found[name]]) is old or new.process not in self._ready:
             if ended():
                 raise Refused(f"the graph ended before {name} was back")
             time.sleep(TICK_SECONDS)
-        return f"{name} is back: process {new.handle.pid}, ready after {new.ready_after:.1f} s"
+        return f"{name} is back: process {new.handle.pid}, ready after {self._ready[new.process]:.1f} s"
 
     def status(self) -> tuple[ProcessStatus, ...]:
         """How every process is, the recorder first."""
@@ -258,7 +259,7 @@ class Guardian:
     def _status_of(self, child: Child) -> ProcessStatus:
         process = child.process
         pulse = self._pulses.of(process)
-        state = self._rates.state(process.stage, process.replica) if pulse and child.announced else "starting"
+        state = self._rates.state(process.stage, process.replica) if pulse and process in self._ready else "starting"
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
@@ -276,6 +277,7 @@ class Guardian:
     # ------------------------------------------------------------------------------------------ care
 
     def _start(self, process: Process) -> Child:
+        self._started[process] = time.monotonic()
         return self._launch.stage(process, self._progress[process.stage])
 
     def _recorder_died(self) -> bool:
@@ -285,7 +287,8 @@ class Guardian:
         """Says who is waited for; ends the graph where one that is needed stays away."""
         for child in self._children.values():
             if hosts.waits(child.process):
-                child.started, child.watch = time.monotonic(), Watch(self._graph.nodes[child.process.stage].limits)
+                self._started[child.process] = time.monotonic()
+                child.watch = Watch(self._graph.nodes[child.process.stage].limits)
         hosts.remind()
         reason = hosts.overdue(self._graph.hosts_of_stages())
         return None if reason is None else End(1, reason)
@@ -293,7 +296,7 @@ class Guardian:
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
         now, name = time.monotonic(), self._name(child.process)
-        change = child.watch.look(now, self._pulses.of(child.process), ready=child.announced)
+        change = child.watch.look(now, self._pulses.of(child.process), ready=child.process in self._ready)
         if change:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):
@@ -315,7 +318,7 @@ class Guardian:
             self._say(f"{name} was {ASKED}", "info")
             self._give_up(child, ASKED, child.crashes)
             return None
-        absent, budget = (process.stage, process.replica) in self._absent, self._budget(process.stage)
+        absent, budget = (process.stage, process.replica) in self._absent(), self._budget(process.stage)
         if absent or child.crashes >= budget:
             self._show_output(child)
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")

@@ -8,7 +8,7 @@ import msgspec
 from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, node_entry
 from runner.graph.placement import Network
 from runner.hosts.head import Hosts
-from runner.message.packet import RECORDER, Process
+from runner.message.packet import Process
 from runner.process.children import Family, spawn
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
@@ -66,7 +66,7 @@ class Launcher:
         self._forks = forks
         self._family = Family()
 
-    def recorder(self) -> Child:
+    def recorder(self, process: Process) -> Child:
         """Starts what writes the recording."""
         run = self._run
         topics = {
@@ -86,7 +86,7 @@ class Launcher:
             steps_only=run.steps_only,
             destinations=run.graph.destinations(),
         )
-        return self._spawn(Process(RECORDER, 0), "runner.process.recorder", msgspec.json.encode(task))
+        return self._spawn(process, "runner.process.recorder", msgspec.json.encode(task))
 
     def viewer(self) -> Child:
         """Starts the viewer on the recording as it grows."""
