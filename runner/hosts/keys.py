@@ -15,9 +15,9 @@ import contextlib
 import datetime
 import ipaddress
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TypeVar
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -27,6 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from runner.contract import Refused
 from runner.graph.placement import READER, Credentials, Host
 
+T = TypeVar("T")
 Extension = tuple[x509.ExtensionType, bool]
 """What a certificate says beside names and dates, and whether who does not understand it must refuse."""
 Signed = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
@@ -175,26 +176,22 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _read_certificate(path: Path) -> x509.Certificate:
-    try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
-    except OSError as error:
-        raise Refused(f"{path}: {error.strerror}{_hint(path)}") from None
-    except ValueError:
-        raise Refused(f"{path}: is no certificate") from None
+    return _read(path, x509.load_pem_x509_certificate, "certificate")
 
 
 def _read_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    try:
-        key = cast("Any", serialization.load_pem_private_key(path.read_bytes(), None))
-    except OSError as error:
-        raise Refused(f"{path}: {error.strerror}{_hint(path)}") from None
-    except (ValueError, TypeError):
-        raise Refused(f"{path}: is no private key") from None
+    key = _read(path, lambda data: serialization.load_pem_private_key(data, None), "private key")
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise Refused(f"{path}: is not a key that `runner keys` made")
     return key
 
 
-def _hint(path: Path) -> str:
-    name = path.parent.name
-    return f"; make keys with `runner keys init`, and copy the folder {name} to the machine that is {name}"
+def _read(path: Path, parse: Callable[[bytes], T], what: str) -> T:
+    try:
+        return parse(path.read_bytes())
+    except OSError as error:
+        name = path.parent.name
+        hint = f"make keys with `runner keys init`, and copy the folder {name} to the machine that is {name}"
+        raise Refused(f"{path}: {error.strerror}; {hint}") from None
+    except (ValueError, TypeError):
+        raise Refused(f"{path}: is no {what}") from None
