@@ -13,11 +13,11 @@ from runner.message.codec import Pulse, Step, answered
 from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
-from runner.process.health import Pulses, Watch
+from runner.process.health import Watch
 from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
 from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
 from runner.supervise.launch import Launcher, Run
-from runner.supervise.status import ProcessStatus, Rates
+from runner.supervise.status import ProcessStatus, Pulses
 from runner.terminal import Terminal
 
 STAGE_GRACE_SECONDS = 2.0
@@ -79,7 +79,6 @@ class Guardian:
         self._viewer: Child | None = None
         self._progress = {stage: Progress(_shared(run.graph, stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
         self._pulses = Pulses()
-        self._rates = Rates()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
         self._quiet: set[Process] = set()
@@ -132,7 +131,7 @@ class Guardian:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
             if child.handle.poll() and child.successor is None:
-                reason = child.reason(self._pulses.of(child.process))
+                reason = child.reason(self._pulses.newest(child.process))
                 self._say(f"{self._name(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
@@ -170,7 +169,7 @@ class Guardian:
             while child.process not in self._ended and time.monotonic() < deadline:
                 time.sleep(TICK_SECONDS / 5)
         if child.process not in self._ended:
-            self._lose(child, child.reason(self._pulses.of(child.process)))
+            self._lose(child, child.reason(self._pulses.newest(child.process)))
 
     def _lose(self, child: Child, reason: str) -> None:
         child.reported = True
@@ -199,8 +198,7 @@ class Guardian:
 
     def note_pulse(self, pulse: Pulse, arrived_ns: int) -> None:
         """Takes a sign of life."""
-        self._pulses.note(pulse)
-        self._rates.note(pulse, arrived_ns)
+        self._pulses.note(pulse, arrived_ns)
 
     def note_settled(self, process: Process) -> None:
         """Takes the recorder's word that it has all that a dead process has sent."""
@@ -258,8 +256,7 @@ class Guardian:
 
     def _status_of(self, child: Child) -> ProcessStatus:
         process = child.process
-        pulse = self._pulses.of(process)
-        state = self._rates.state(process.stage, process.replica) if pulse and process in self._ready else "starting"
+        state = self._pulses.state(process) if process in self._ready else "starting"
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
@@ -268,10 +265,8 @@ class Guardian:
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
-            pulse=pulse,
-            cpu=self._rates.cpu(process.stage, process.replica),
-            steps_per_second=self._rates.steps(process.stage, process.replica),
-            sent=self._rates.sent(process.stage, process.replica),
+            pulse=self._pulses.newest(process),
+            **self._pulses.rates(process),
         )
 
     # ------------------------------------------------------------------------------------------ care
@@ -296,7 +291,7 @@ class Guardian:
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
         now, name = time.monotonic(), self._name(child.process)
-        change = child.watch.look(now, self._pulses.of(child.process), ready=child.process in self._ready)
+        change = child.watch.look(now, self._pulses.newest(child.process), ready=child.process in self._ready)
         if change:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):
@@ -311,7 +306,7 @@ class Guardian:
     def _replace(self, child: Child) -> End | None:
         """Has a dead process replaced within its budget; otherwise says why the graph ends."""
         process, name = child.process, self._name(child.process)
-        reason = child.reason(self._pulses.of(process))
+        reason = child.reason(self._pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
         if child.retires_by is not None and not child.condemned:
