@@ -1,13 +1,15 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
+import contextlib
 import signal
+import subprocess
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from runner.graph.graph import Limits
+from runner.graph.graph import Limits, Route
 from runner.message.codec import Pulse, Step, answered
 from runner.message.ids import MessageId
 from runner.message.packet import Process
@@ -29,7 +31,7 @@ class Child:
     handle: Handle
     log: Path
     crashes: int = 0
-    """How often this process has crashed before, whatever else it was restarted for."""
+    """How often it and its predecessors have, whatever else they were restarted for."""
     restarted_because: str = ""
     """Why its predecessor ended."""
     retires_by: float | None = None
@@ -42,8 +44,8 @@ class Child:
     condemned: str = ""
     """Why the supervisor kills it."""
     dies_at: float = float("inf")
-    successor: tuple[str, int] | None = None
-    """Once it is dead: why it is replaced, and how often it has crashed by now."""
+    replaced_because: str = ""
+    """Once it is dead and another is to take its place."""
     dead_since: float = float("inf")
     """When it was found dead before it was seen."""
     reported: bool = False
@@ -63,18 +65,26 @@ class Child:
         out_of_memory = code == -signal.SIGKILL and oom_kills() > self.oom_kills
         return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
 
+    def end(self, grace_seconds: float) -> None:
+        """Asks it to end, kills it where it does not, and whatever it has left behind."""
+        self.handle.signal_group(signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.handle.wait(grace_seconds)
+        self.handle.signal_group(signal.SIGKILL)
+        self.handle.wait()
+
 
 class Progress:
     """How far a stage has come: what its next process must know."""
 
-    def __init__(self, shared: frozenset[tuple[str, str, str]]):
-        """``shared`` are the (output, consumer, port) of edges whose messages are dealt to replicas."""
+    def __init__(self, routes: Iterable[Route]):
+        """``routes`` are the edges that leave the stage."""
         self.numbers: dict[str, int] = {}
         """Next sequence number by output port."""
         self.started = False
         self.undone: dict[tuple[str, str, str], None] = {}
         """(consumer, port, id) of parts that were sent and not done with."""
-        self._shared = shared
+        self._shared = [route for route in routes if route.shared]
         self._consumed: OrderedDict[tuple[str, str], None] = OrderedDict()
 
     @property
@@ -98,15 +108,9 @@ class Progress:
         for id in step.emitted:
             one = MessageId.of(id)
             self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
-            for output, consumer, input in self._shared:
-                if output == one.port and not consumers[consumer].has_done(input, id):
-                    self.undone[consumer, input, id] = None
-
-
-def signal_all(children: Iterable[Child], signum: signal.Signals) -> None:
-    """Signals processes with all that they have started."""
-    for child in children:
-        child.handle.signal_group(signum)
+            for route in self._shared:
+                if route.output == one.port and not consumers[route.consumer].has_done(route.input, id):
+                    self.undone[route.consumer, route.input, id] = None
 
 
 def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child], bool] = lambda _: False) -> None:
@@ -115,12 +119,3 @@ def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child]
     for child in children:
         while child.handle.poll() is None and not enough(child) and time.monotonic() < deadline:
             time.sleep(LOOK_SECONDS)
-
-
-def end_all(children: Sequence[Child], grace_seconds: float) -> None:
-    """Asks children to end, kills those that do not, and whatever they have left behind."""
-    signal_all(children, signal.SIGTERM)
-    wait_for(children, grace_seconds)
-    signal_all(children, signal.SIGKILL)
-    for child in children:
-        child.handle.wait()

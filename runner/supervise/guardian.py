@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from runner.contract import Level, Refused, Restarted
 from runner.graph.document import suggest
-from runner.graph.graph import SUPERVISOR, Graph
+from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
 from runner.message.codec import Pulse, Step, answered
 from runner.message.packet import RECORDER, Process
@@ -15,7 +15,7 @@ from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
-from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
+from runner.supervise.child import Child, Progress, wait_for
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Pulses
 from runner.terminal import Terminal
@@ -77,7 +77,7 @@ class Guardian:
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
-        self._progress = {stage: Progress(_shared(run.graph, stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
+        self._progress = {stage: Progress(run.graph.routes(stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
         self._pulses = Pulses()
         self._settled: set[Process] = set()
         """Dead processes of which the recorder has everything."""
@@ -98,7 +98,7 @@ class Guardian:
         self._started[process] = time.monotonic()
         self._recorder = self._launch.recorder(process)
         while view and process not in self._ready:
-            if self._recorder_died():
+            if self._recorder.handle.poll() is not None:
                 return
             time.sleep(TICK_SECONDS)
         if view:
@@ -114,15 +114,15 @@ class Guardian:
         """Kills what hangs and replaces what has died; returns why the graph ends where that is not possible."""
         if self._recorder is not None:
             self._check(self._recorder)
-            if self._recorder_died():
+            if self._recorder.handle.poll() is not None:
                 return End(1, f"the recorder {self._recorder.reason()}")
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
             elif child.process not in self._ready and time.monotonic() < child.dead_since + SEEN_SECONDS:
                 child.dead_since = min(child.dead_since, time.monotonic())  # it may have been ready, and not seen yet
-            elif child.successor is not None:
-                self._start_successor(child, *child.successor)
+            elif child.replaced_because:
+                self._start_successor(child)
             elif (end := self._replace(child)) is not None:
                 return end
         return None if self._hosts is None else self._look_after_hosts(self._hosts)
@@ -130,15 +130,16 @@ class Guardian:
     def name_the_dead(self) -> None:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
-            if child.handle.poll() and child.successor is None:
+            if child.handle.poll() and not child.replaced_because:
                 reason = child.reason(self._pulses.newest(child.process))
-                self._say(f"{self._name(child.process)} died meanwhile: {reason}", "warning")
+                self._say(f"{self._run.name_of(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
     def end(self) -> None:
         """Ends the stages: each says what it leaves once nobody publishes any more. Says which are killed."""
         children = list(self._children.values())
-        signal_all(children, signal.SIGTERM)
+        for child in children:
+            child.handle.signal_group(signal.SIGTERM)
         wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self._quiet)
         for child in children:
             if child.handle.poll() is None and child.process not in self._quiet:
@@ -147,15 +148,17 @@ class Guardian:
                 child.handle.wait()
             self._report_lost(child)
         wait_for(children, END_GRACE_SECONDS)
-        signal_all(children, signal.SIGKILL)
+        for child in children:
+            child.handle.signal_group(signal.SIGKILL)
         for child in children:
             child.handle.wait()
             self._report_lost(child)
 
     def end_recorder(self) -> str:
         """Ends the recorder and the viewer, then what the stages have left; returns the recorder's verdict."""
-        end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
-        end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
+        for child, grace_seconds in ((self._recorder, RECORDER_GRACE_SECONDS), (self._viewer, STAGE_GRACE_SECONDS)):
+            if child is not None:
+                child.end(grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
@@ -214,7 +217,7 @@ class Guardian:
             awaited = self.awaited()
             self._ready[process] = time.monotonic() - self._started[process]
             if process.stage != RECORDER:
-                self._terminal.show(self._name(process), f"ready after {self._ready[process]:.1f} s")
+                self._terminal.show(self._run.name_of(process), f"ready after {self._ready[process]:.1f} s")
             if awaited and not self.awaited():
                 self._terminal.show(SUPERVISOR, f"all {len(self._graph.processes())} processes are ready")
 
@@ -223,7 +226,7 @@ class Guardian:
     def awaited(self) -> list[str]:
         """Names of those who must hear what is published and have never been ready, then the recorder; none: ready."""
         if absent := self._absent():
-            return sorted(self._run.name_of(*key) for key in absent)
+            return sorted(self._run.name_of(Process(*key)) for key in absent)
         return [] if Process(RECORDER, 0) in self._ready else [RECORDER]
 
     def _absent(self) -> list[tuple[str, int]]:
@@ -236,7 +239,7 @@ class Guardian:
 
         Raises Refused where there is no such process, or the graph has ``ended`` meanwhile.
         """
-        found = {self._run.name_of(*key): key for key in self._graph.processes()}
+        found = {self._run.name_of(Process(*key)): key for key in self._graph.processes()}
         if name not in found:
             raise Refused(f"no process {name!r}{suggest(name, found)}")
         old = self._children.get(found[name])
@@ -260,7 +263,7 @@ class Guardian:
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
-            name=self._name(process),
+            name=self._run.name_of(process),
             state=state if child.handle.poll() is None else "ended",
             pid=child.handle.pid,
             restarts=process.incarnation,
@@ -275,9 +278,6 @@ class Guardian:
         self._started[process] = time.monotonic()
         return self._launch.stage(process, self._progress[process.stage])
 
-    def _recorder_died(self) -> bool:
-        return self._recorder is not None and self._recorder.handle.poll() is not None
-
     def _look_after_hosts(self, hosts: Hosts) -> End | None:
         """Says who is waited for; ends the graph where one that is needed stays away."""
         for child in self._children.values():
@@ -290,7 +290,7 @@ class Guardian:
 
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
-        now, name = time.monotonic(), self._name(child.process)
+        now, name = time.monotonic(), self._run.name_of(child.process)
         change = child.watch.look(now, self._pulses.newest(child.process), ready=child.process in self._ready)
         if change:
             self._say(f"{name} {change}", "warning")
@@ -305,13 +305,13 @@ class Guardian:
 
     def _replace(self, child: Child) -> End | None:
         """Has a dead process replaced within its budget; otherwise says why the graph ends."""
-        process, name = child.process, self._name(child.process)
+        process, name = child.process, self._run.name_of(child.process)
         reason = child.reason(self._pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
         if child.retires_by is not None and not child.condemned:
             self._say(f"{name} was {ASKED}", "info")
-            self._give_up(child, ASKED, child.crashes)
+            self._give_up(child, ASKED)
             return None
         absent, budget = (process.stage, process.replica) in self._absent(), self._budget(process.stage)
         if absent or child.crashes >= budget:
@@ -319,7 +319,8 @@ class Guardian:
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
         self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")
         self._show_output(child)
-        self._give_up(child, reason, child.crashes + 1)
+        child.crashes += 1
+        self._give_up(child, reason)
         return None
 
     def _budget(self, stage: str) -> int:
@@ -327,30 +328,23 @@ class Guardian:
         forgets = self._run.steps_only and self._run.remembers(stage)
         return 0 if forgets else self._graph.nodes[stage].restarts
 
-    def _give_up(self, child: Child, reason: str, crashes: int) -> None:
+    def _give_up(self, child: Child, reason: str) -> None:
         """Tells everybody that a process is dead and will be replaced."""
-        child.successor, child.dies_at = (reason, crashes), time.monotonic()
+        child.replaced_because, child.dies_at = reason, time.monotonic()
         self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
         if left := self._launch.end_rest(child.process):
-            self._say(f"{self._name(child.process)} {behind(left)}", "warning")
+            self._say(f"{self._run.name_of(child.process)} {behind(left)}", "warning")
 
-    def _start_successor(self, child: Child, reason: str, crashes: int) -> None:
+    def _start_successor(self, child: Child) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
         if process not in self._settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
             return
         successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
-        successor.restarted_because, successor.crashes = reason, crashes
+        successor.restarted_because, successor.crashes = child.replaced_because, child.crashes
         self._children[process.stage, process.replica] = successor
 
     def _show_output(self, child: Child) -> None:
         for line in last_lines(child.log, SHOWN_LINES, child.log_from):
-            self._terminal.show(self._name(child.process), f"| {line}", "error")
-
-    def _name(self, process: Process) -> str:
-        return self._run.name_of(process.stage, process.replica)
-
-
-def _shared(graph: Graph, stage: str) -> frozenset[tuple[str, str, str]]:
-    return frozenset((route.output, route.consumer, route.input) for route in graph.routes(stage) if route.shared)
+            self._terminal.show(self._run.name_of(child.process), f"| {line}", "error")

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -81,17 +82,19 @@ class Supervisor:
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
         self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
-        self._delivery = Delivery(graph.routes(SUPERVISOR), self._give, self._warn, self._stopping.is_set)
+        self._delivery = Delivery(
+            graph.routes(SUPERVISOR), self._give, partial(self._say, level="warning"), self._stopping.is_set
+        )
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
         self._times, self._skipped = StageTimes(), Skipped(graph)
-        self._refusals = Refusals(self._complain)
+        self._refusals = Refusals(partial(self._say, level="error"))
         self._guardian = Guardian(
             run,
             self._hosts,
             terminal,
             forks,
             say=self._say,
-            announce=self._publish_restart,
+            announce=partial(self._publish, port_name(Restarted)),
             declare_lost=self._declare_lost,
         )
         self._numbers: dict[str, int] = defaultdict(int)
@@ -116,7 +119,10 @@ class Supervisor:
             end = self._watch()
         finally:
             verdict = self._stop()
-        return self._dismiss(self._conclude(end, verdict))
+        end = self._conclude(end, verdict)
+        if self._hosts is not None:
+            self._hosts.close(end.code, end.reason)
+        return end
 
     def _watch(self) -> End:
         """Waits for the end, and has looked after the processes meanwhile."""
@@ -125,8 +131,7 @@ class Supervisor:
                 end = self._events.get(timeout=TICK_SECONDS)
                 self._guardian.name_the_dead()
                 return end
-            end = self._guardian.look()
-            if end is not None:
+            if (end := self._guardian.look()) is not None:
                 return end
 
     # ------------------------------------------------------------------------------------------ what is heard
@@ -169,7 +174,7 @@ class Supervisor:
         if line is not None:
             self._calls.note_log(line)
             if line.stage != SUPERVISOR and line.level != "debug":
-                self._terminal.show(self._run.name_of(line.stage, line.replica), line.text, line.level)
+                self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
 
     def _on_finished(self, packet: Packet) -> None:
         try:
@@ -199,9 +204,6 @@ class Supervisor:
         self._guardian.note_presence(process, present)
 
     # ------------------------------------------------------------------------------------------ what is published
-
-    def _publish_restart(self, restarted: Restarted) -> None:
-        self._publish(port_name(Restarted), restarted)
 
     def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> None:
         """Sends a message of the supervisor's own; ``say`` is told its id before anybody else."""
@@ -254,12 +256,6 @@ class Supervisor:
         self._terminal.plain(f"recording {verdict}")
         return end if self._guardian.complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
 
-    def _dismiss(self, end: End) -> End:
-        """Tells the other hosts how it ended."""
-        if self._hosts is not None:
-            self._hosts.close(end.code, end.reason)
-        return end
-
     # ------------------------------------------------------------------------------------------ what is asked
 
     def _serve(self) -> None:
@@ -303,12 +299,6 @@ class Supervisor:
         self._terminal.show(SUPERVISOR, text, level)
         line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
         self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
-
-    def _complain(self, text: str) -> None:
-        self._say(text, "error")
-
-    def _warn(self, text: str) -> None:
-        self._say(text, "warning")
 
 
 def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
