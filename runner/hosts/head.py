@@ -173,7 +173,7 @@ class _Place:
     """Of the session that takes part now."""
     lost_at: float | None = None
     children: dict[Process, RemoteChild] = field(default_factory=dict[Process, RemoteChild])
-    waiting: list[Start] = field(default_factory=list[Start])
+    waiting: dict[Process, Start] = field(default_factory=dict[Process, Start])
     """What it is to start once it is there."""
 
 
@@ -215,8 +215,7 @@ class Hosts:
 
     def waits(self, process: Process) -> bool:
         """Whether a process has not been started yet, because its host is not there."""
-        with self._changed:
-            return any(start.process == process for place in self._places.values() for start in place.waiting)
+        return any(process in place.waiting for place in self._places.values())
 
     def remind(self) -> None:
         """Says from time to time which hosts are still waited for."""
@@ -266,9 +265,9 @@ class Hosts:
                 raise Refused(f"host {hello.host} takes part already; valid: one `runner up` a host")
             back = place.lost_at is not None
             place.hello, place.lost_at = hello, None
-            waiting, place.waiting = place.waiting, []
-            for start in waiting:
+            for start in place.waiting.values():
                 self._order(place, start)
+            place.waiting.clear()
         self._say(f"host {hello.host} is {'back' if back else 'there'}", "info")
         if hello.source != own.source:
             self._say(f"host {hello.host} has {hello.source}, the head {own.source}", "warning")
@@ -318,9 +317,9 @@ class Hosts:
                     order = Start(order.process, self._moved(order.task, place.hello))
                 self._bus.publish(f"order/{place.name}/{place.hello.session}", msgspec.json.encode(order))
             elif isinstance(order, Start):
-                place.waiting.append(order)
+                place.waiting[order.process] = order
             elif isinstance(order, Signal) and order.process in place.children:
-                place.waiting = [start for start in place.waiting if start.process != order.process]
+                place.waiting.pop(order.process, None)
                 place.children.pop(order.process).end(0, "")
 
     def _moved(self, task: Assignment, hello: Hello) -> Assignment:

@@ -9,7 +9,7 @@ from runner.contract import Level, Refused, Restarted
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
-from runner.message.codec import Pulse, Step, answered
+from runner.message.codec import Step, answered
 from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
@@ -61,7 +61,7 @@ class Guardian:
         forks: ForkServer,
         *,
         say: Callable[[str, Level], None],
-        announce: Callable[[Restarted], None],
+        announce: Callable[[Restarted], object],
         declare_lost: Callable[[Process, str], None],
     ):
         """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced, and
@@ -78,11 +78,12 @@ class Guardian:
         self._recorder: Child | None = None
         self._viewer: Child | None = None
         self._progress = {stage: Progress(run.graph.routes(stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
-        self._pulses = Pulses()
-        self._settled: set[Process] = set()
-        """Dead processes of which the recorder has everything."""
-        self._quiet: set[Process] = set()
-        """Those that publish no messages any more."""
+        self.pulses = Pulses()
+        """Signs of life; whoever hears one notes it."""
+        self.settled: set[Process] = set()
+        """Dead processes of which the recorder says that it has all that they have sent."""
+        self.quiet: set[Process] = set()
+        """Processes that say that they publish no messages any more."""
         self._ended: set[Process] = set()
         """Those that have journalled their end."""
         self._started: dict[Process, float] = {}
@@ -131,7 +132,7 @@ class Guardian:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
             if child.handle.poll() and not child.replaced_because:
-                reason = child.reason(self._pulses.newest(child.process))
+                reason = child.reason(self.pulses.newest(child.process))
                 self._say(f"{self._run.name_of(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
@@ -140,9 +141,9 @@ class Guardian:
         children = list(self._children.values())
         for child in children:
             child.handle.signal_group(signal.SIGTERM)
-        wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self._quiet)
+        wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self.quiet)
         for child in children:
-            if child.handle.poll() is None and child.process not in self._quiet:
+            if child.handle.poll() is None and child.process not in self.quiet:
                 child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
                 child.handle.signal_group(signal.SIGKILL)
                 child.handle.wait()
@@ -172,7 +173,7 @@ class Guardian:
             while child.process not in self._ended and time.monotonic() < deadline:
                 time.sleep(TICK_SECONDS / 5)
         if child.process not in self._ended:
-            self._lose(child, child.reason(self._pulses.newest(child.process)))
+            self._lose(child, child.reason(self.pulses.newest(child.process)))
 
     def _lose(self, child: Child, reason: str) -> None:
         child.reported = True
@@ -194,18 +195,6 @@ class Guardian:
         for port, id in answered(step):
             if (edge := self._graph.nodes[step.stage].inputs.get(port)) is not None:
                 self._progress[edge.stage].undone.pop((step.stage, port, id), None)
-
-    def note_quiet(self, process: Process) -> None:
-        """Takes note of a process that publishes no more."""
-        self._quiet.add(process)
-
-    def note_pulse(self, pulse: Pulse, arrived_ns: int) -> None:
-        """Takes a sign of life."""
-        self._pulses.note(pulse, arrived_ns)
-
-    def note_settled(self, process: Process) -> None:
-        """Takes the recorder's word that it has all that a dead process has sent."""
-        self._settled.add(process)
 
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""
@@ -255,11 +244,11 @@ class Guardian:
 
     def status(self) -> tuple[ProcessStatus, ...]:
         """How every process is, the recorder first."""
-        return tuple(map(self._status_of, [*filter(None, [self._recorder]), *list(self._children.values())]))
+        return tuple(map(self._status_of, filter(None, (self._recorder, *self._children.values()))))
 
     def _status_of(self, child: Child) -> ProcessStatus:
         process = child.process
-        state = self._pulses.state(process) if process in self._ready else "starting"
+        state = self.pulses.state(process) if process in self._ready else "starting"
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
@@ -268,8 +257,8 @@ class Guardian:
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
-            pulse=self._pulses.newest(process),
-            **self._pulses.rates(process),
+            pulse=self.pulses.newest(process),
+            **self.pulses.rates(process),
         )
 
     # ------------------------------------------------------------------------------------------ care
@@ -291,7 +280,7 @@ class Guardian:
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
         now, name = time.monotonic(), self._run.name_of(child.process)
-        change = child.watch.look(now, self._pulses.newest(child.process), ready=child.process in self._ready)
+        change = child.watch.look(now, self.pulses.newest(child.process), ready=child.process in self._ready)
         if change:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):
@@ -306,7 +295,7 @@ class Guardian:
     def _replace(self, child: Child) -> End | None:
         """Has a dead process replaced within its budget; otherwise says why the graph ends."""
         process, name = child.process, self._run.name_of(child.process)
-        reason = child.reason(self._pulses.newest(process))
+        reason = child.reason(self.pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
         if child.retires_by is not None and not child.condemned:
@@ -339,7 +328,7 @@ class Guardian:
     def _start_successor(self, child: Child) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
-        if process not in self._settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
+        if process not in self.settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
             return
         successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
         successor.restarted_because, successor.crashes = child.replaced_because, child.crashes

@@ -141,8 +141,8 @@ class Supervisor:
         subscribe("j/*", self._on_journal)
         subscribe("l/*", self._on_log)
         subscribe(f"m/*/{FINISHED}", self._on_finished)
-        subscribe("settled/**", lambda packet: self._on_word(packet, self._guardian.note_settled))
-        subscribe("e/**", lambda packet: self._on_word(packet, self._guardian.note_quiet))
+        subscribe("settled/**", partial(self._on_word, self._guardian.settled))
+        subscribe("e/**", partial(self._on_word, self._guardian.quiet))
         subscribe("h/**", self._on_pulse)
         for key in self._calls.answer_keys:
             subscribe(f"m/{key}", self._on_answer)
@@ -184,17 +184,17 @@ class Supervisor:
         else:
             self._events.put(End(finished.code, finished.reason))
 
-    def _on_word(self, packet: Packet, note: Callable[[Process], None]) -> None:
+    def _on_word(self, named: set[Process], packet: Packet) -> None:
         """What is said of the process that a key names."""
         try:
-            note(Process.of(packet.key))
+            named.add(Process.of(packet.key))
         except Refused as refusal:
             self._refusals.refuse(packet.key, refusal)
 
     def _on_pulse(self, packet: Packet) -> None:
         pulse = self._refusals.read(Pulse, packet)
         if pulse is not None:
-            self._guardian.note_pulse(pulse, packet.arrived_ns)
+            self._guardian.pulses.note(pulse, packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
@@ -205,8 +205,8 @@ class Supervisor:
 
     # ------------------------------------------------------------------------------------------ what is published
 
-    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> None:
-        """Sends a message of the supervisor's own; ``say`` is told its id before anybody else."""
+    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> str:
+        """Sends a message of the supervisor's own and returns its id; ``say`` is told that before anybody else."""
         with self._numbering:
             own = f"{SUPERVISOR}.{port}#{self._numbers[port]}"
             self._numbers[port] += 1
@@ -217,6 +217,7 @@ class Supervisor:
             self._delivery.publish(port, envelope, lambda: self._bus.publish(f"m/{SUPERVISOR}/{port}", payload))
         finally:
             self._journal((own,))
+        return own
 
     def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
         with self._numbering:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
 
@@ -260,7 +260,13 @@ def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> 
 def test_a_call_is_done_when_every_replica_has_done_it() -> None:
     graph = load_graph(ACCOUNT)
     graph.nodes["account"] = dataclasses.replace(graph.nodes["account"], replicas=2)
-    calls = Calls(graph, lambda port, _, say: say(f"supervisor.{port}#0"))
+
+    def publish(port: str, _: object, say: Callable[[str], None]) -> str:
+        id = f"supervisor.{port}#0"
+        say(id)
+        return id
+
+    calls = Calls(graph, publish)
     id = calls.call(CallRequest("account", "add", {"amount": "1"}))
     step = Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0)
     calls.note_step(step)
