@@ -5,17 +5,18 @@ import itertools
 import os
 import queue
 import signal
+import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from runner.contract import Finished, Level, Message, Refused, Restarted
-from runner.graph.graph import FINISHED, SUPERVISOR, Graph
+from runner.graph.graph import FINISHED, SUPERVISOR, Graph, Route
 from runner.graph.placement import ALONE
 from runner.graph.ports import port_name
 from runner.hosts.head import Hosts
@@ -25,7 +26,7 @@ from runner.message import codec
 from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.delivery import Delivery
+from runner.process.delivery import Delivery, Stopped
 from runner.process.fork_server import ForkServer
 from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
@@ -82,9 +83,8 @@ class Supervisor:
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
         self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
-        self._delivery = Delivery(
-            graph.routes(SUPERVISOR), self._give, partial(self._say, level="warning"), self._stopping.is_set
-        )
+        warn = partial(self._say, level="warning")
+        self._delivery = Delivery(_own_routes(graph), self._give, warn, self._stopping.is_set)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
         self._times, self._skipped = StageTimes(), Skipped(graph)
         self._refusals = Refusals(partial(self._say, level="error"))
@@ -99,7 +99,9 @@ class Supervisor:
         )
         self._numbers: dict[str, int] = defaultdict(int)
         """Next sequence number by output port of the supervisor."""
-        self._numbering = threading.Lock()
+        self._numbering = threading.Condition()
+        self._publishing = 0
+        """Messages of the supervisor's own that have a number and no step yet."""
         self._own_steps = 0
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
@@ -208,15 +210,23 @@ class Supervisor:
     def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> str:
         """Sends a message of the supervisor's own and returns its id; ``say`` is told that before anybody else."""
         with self._numbering:
+            if self._stopping.is_set():
+                raise Refused("the graph ends")
             own = f"{SUPERVISOR}.{port}#{self._numbers[port]}"
+            envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
+            send = partial(self._bus.publish, f"m/{SUPERVISOR}/{port}", codec.pack(envelope))
             self._numbers[port] += 1
+            self._publishing += 1
         say(own)
-        envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
-        payload = codec.pack(envelope)
         try:
-            self._delivery.publish(port, envelope, lambda: self._bus.publish(f"m/{SUPERVISOR}/{port}", payload))
+            self._delivery.publish(port, envelope, send)
+        except Stopped:
+            send()  # it has its number: nobody does it, but it is recorded, and left by who should have
         finally:
             self._journal((own,))
+            with self._numbering:
+                self._publishing -= 1
+                self._numbering.notify_all()
         return own
 
     def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
@@ -238,7 +248,9 @@ class Supervisor:
 
     def _stop(self) -> str:
         """Ends all processes and what connects them, and returns the recorder's verdict."""
-        self._stopping.set()
+        with self._numbering:
+            self._stopping.set()
+            self._numbering.wait_for(lambda: not self._publishing, RECORDED_SECONDS)
         self._calls.close()
         self._bus.publish(f"e/{self._own.path}", b"")
         self._guardian.end()
@@ -300,6 +312,13 @@ class Supervisor:
         self._terminal.show(SUPERVISOR, text, level)
         line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
         self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
+
+
+def _own_routes(graph: Graph) -> Iterator[Route]:
+    """What the supervisor publishes: who replaces the dead must not wait until one of them has room."""
+    for route in graph.routes(SUPERVISOR):
+        waits = route.output in graph.commands()
+        yield route if waits else msgspec.structs.replace(route, queue=sys.maxsize)
 
 
 def _new_recording(folder: Path, name: str) -> tuple[str, Path]:

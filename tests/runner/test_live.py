@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
@@ -21,7 +22,7 @@ import pytest
 from runner.cli.completion import Shell, script
 from runner.cli.doctor import examine, examine_graph
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.graph import QUEUE, load_graph
 from runner.inspect.echo import lines_of
 from runner.live.live import Live
 from runner.live.tables import show_progress
@@ -255,6 +256,23 @@ def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> 
     with Live(account.entry) as live:
         os.kill(account.pid_of("account"), signal.SIGKILL)
         assert call(live, "add", amount="5").lines == (("info", "5 added"),)
+
+
+def test_a_call_that_waits_for_room_when_the_graph_ends_spoils_no_recording(tmp_path: Path) -> None:
+    run = Run(tmp_path, ACCOUNT, "counter.count=0")
+    one = CallRequest("account", "add", {"amount": "1"})
+    with Live(run.entry) as live, ThreadPoolExecutor() as pool:
+        os.kill(run.pid_of("account"), signal.SIGSTOP)
+        for _ in range(QUEUE):
+            live.call(one)
+        waiting = pool.submit(live.call, one)
+        wait_until(lambda: live.status().published["supervisor/account_add"] == QUEUE + 1)
+        live.down()
+        assert waiting.result() == f"supervisor.account_add#{QUEUE}"
+        with pytest.raises(Refused, match="the graph ends"):
+            live.call(one)
+    finished = run.finish()
+    assert str(Recording(finished.recording).verdict) == "COMPLETE", finished.output
 
 
 def test_a_call_is_done_when_every_replica_has_done_it() -> None:

@@ -170,6 +170,23 @@ def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     assert code == 0, said
 
 
+MOURNER = """
+  mourner:
+    stage: tests.runner.survivors:Mourner
+    inputs: {restarted: {from: supervisor.restarted, queue: 1}}
+"""
+
+
+def test_who_replaces_the_dead_waits_for_none_of_them(tmp_path: Path):
+    graph = tmp_path / "graph.yaml"
+    graph.write_text(DOUBLES.read_text() + MOURNER)
+    settings = ("counter.count=60", "counter.period=0.05", "sink.count=60", "doubler.die_at=2")
+    ended = run(graph, tmp_path, *settings)
+    assert (ended.code, len(ended.result)) == (0, 60), ended.output
+    assert re.findall(r"(\w+) restarts \(1 of 3\): killed by SIGKILL", ended.output) == ["doubler", "mourner"]
+    assert Recording(ended.recording).verdict.complete
+
+
 @pytest.mark.parametrize("way", ["quit", "interrupt"])
 def test_a_handler_that_leaves_the_process_has_failed(tmp_path: Path, way: str):
     left = run(changed(DOUBLES, tmp_path, Doubler="Quitter"), tmp_path, f"doubler.way={way}")
