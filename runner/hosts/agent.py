@@ -27,7 +27,6 @@ from runner.hosts.head import (
     Signal,
     Start,
     Started,
-    Welcome,
     control,
     introduce,
     network_of,
@@ -102,8 +101,7 @@ class Agent:
                 if isinstance(event, Dismiss):
                     return event
         hello = introduce(self._document, self._host, self._session)
-        answer = self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS)
-        run = msgspec.json.decode(answer, type=Welcome).run
+        run = self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS).decode()
         self._say(f"takes part in run {run}")
         self._folder = (self._recordings / run).absolute()
         (self._folder / "log").mkdir(parents=True, exist_ok=True)

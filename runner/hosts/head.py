@@ -3,7 +3,7 @@
 Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learns when it joins:
 
 ==========================  ======================================================================================
-``q/join``                  a host's question (:class:`Hello`), answered with :class:`Welcome` or the reason why not
+``q/join``                  a host's question (:class:`Hello`), answered with the run's id or the reason why not
 ``q/past``                  the recording so far, from an offset on: what a stateful stage lived before a restart
 ``order/HOST/SESSION``      what the host is to do (:data:`Order`); only the head may publish here
 ``report/HOST/SESSION``     what has come of it (:data:`Report`)
@@ -69,12 +69,6 @@ class Hello(msgspec.Struct, frozen=True):
     fingerprint: str
     source: str
     """Of the runner and of the stages."""
-
-
-class Welcome(msgspec.Struct, frozen=True):
-    """What a host is told when it takes part."""
-
-    run: str
 
 
 class Start(msgspec.Struct, frozen=True, tag=True):
@@ -201,7 +195,7 @@ class Hosts:
         self._bus.serve("past", lambda offset: _read(recording, int(offset)))
         self._bus.subscribe("report/*/*", self._on_report)
         self._bus.watch(self._on_presence)
-        self._bus.serve("join", lambda text: msgspec.json.encode(self._join(msgspec.json.decode(text, type=Hello))))
+        self._bus.serve("join", lambda text: self._join(msgspec.json.decode(text, type=Hello)).encode())
         self._bus.announce()
 
     def start(self, host: str, process: Process, task: Assignment, log: Path) -> RemoteChild:
@@ -250,8 +244,8 @@ class Hosts:
 
     # ------------------------------------------------------------------------------------------ what is heard
 
-    def _join(self, hello: Hello) -> Welcome:
-        """Takes a host in, or raises Refused with the reason."""
+    def _join(self, hello: Hello) -> str:
+        """Takes a host in and returns the run's id, or raises Refused with the reason."""
         place = self._places.get(hello.host)
         if place is None:
             raise Refused(f"host {hello.host!r}: the head starts that itself{suggest(hello.host, self._places)}")
@@ -274,7 +268,7 @@ class Hosts:
         if hello.fingerprint != own.fingerprint:
             floats = "floats may differ in their last bits"
             self._say(f"host {hello.host} has another processor or other libraries: {floats}", "warning")
-        return Welcome(self._run)
+        return self._run
 
     def _on_presence(self, process: Process, present: bool) -> None:
         place = self._places.get(process.stage)

@@ -3,9 +3,8 @@
 import contextlib
 import signal
 import subprocess
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, gigabytes, oom_kills
 
-LOOK_SECONDS = 0.01
 REMEMBERED = 10_000
 """Messages of which it is known that a stage has done with them."""
 RESENT = 1000
@@ -57,19 +55,18 @@ class Child:
         """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
         if self.condemned:
             return self.condemned
-        code = self.handle.returncode
-        lines = last_lines(self.log, 1, self.log_from)
-        if lines and code is not None and code >= 0:
+        code = self.handle.returncode or 0
+        if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
             return lines[0]
+        if code != -signal.SIGKILL or oom_kills() == self.oom_kills:
+            return ending(code)
         held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
-        out_of_memory = code == -signal.SIGKILL and oom_kills() > self.oom_kills
-        return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
+        return f"{ending(code)}: the kernel was out of memory{held}"
 
-    def end(self, grace_seconds: float) -> None:
-        """Asks it to end, kills it where it does not, and whatever it has left behind."""
-        self.handle.signal_group(signal.SIGTERM)
+    def wait(self, seconds: float) -> None:
+        """Waits for its end, and kills it where that does not come, and whatever it has left behind."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.handle.wait(grace_seconds)
+            self.handle.wait(seconds)
         self.handle.signal_group(signal.SIGKILL)
         self.handle.wait()
 
@@ -111,11 +108,3 @@ class Progress:
             for route in self._shared:
                 if route.output == one.port and not consumers[route.consumer].has_done(route.input, id):
                     self.undone[route.consumer, route.input, id] = None
-
-
-def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child], bool] = lambda _: False) -> None:
-    """Waits until each has ended, or where that is ``enough``; not for longer than some seconds."""
-    deadline = time.monotonic() + seconds
-    for child in children:
-        while child.handle.poll() is None and not enough(child) and time.monotonic() < deadline:
-            time.sleep(LOOK_SECONDS)

@@ -15,7 +15,7 @@ from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
-from runner.supervise.child import Child, Progress, wait_for
+from runner.supervise.child import Child, Progress
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Pulses
 from runner.terminal import Terminal
@@ -32,6 +32,8 @@ RECORDER_GRACE_SECONDS = 30.0
 """What the recorder may take to write what waits for the disk."""
 TICK_SECONDS = 0.05
 """Between two looks at the processes."""
+LOOK_SECONDS = 0.01
+"""The same at the end, when somebody waits."""
 DUMP_SECONDS = 0.5
 """What a hung process gets to print where it hangs before it is killed."""
 SETTLE_SECONDS = 30.0
@@ -141,25 +143,28 @@ class Guardian:
         children = list(self._children.values())
         for child in children:
             child.handle.signal_group(signal.SIGTERM)
-        wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self.quiet)
+        deadline = time.monotonic() + STAGE_GRACE_SECONDS
+        while time.monotonic() < deadline and any(map(self._publishes, children)):
+            time.sleep(LOOK_SECONDS)
+        for child in filter(self._publishes, children):
+            child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
+            child.wait(0)
         for child in children:
-            if child.handle.poll() is None and child.process not in self.quiet:
-                child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
-                child.handle.signal_group(signal.SIGKILL)
-                child.handle.wait()
             self._report_lost(child)
-        wait_for(children, END_GRACE_SECONDS)
+        deadline = time.monotonic() + END_GRACE_SECONDS
         for child in children:
-            child.handle.signal_group(signal.SIGKILL)
-        for child in children:
-            child.handle.wait()
+            child.wait(deadline - time.monotonic())
             self._report_lost(child)
+
+    def _publishes(self, child: Child) -> bool:
+        return child.handle.poll() is None and child.process not in self.quiet
 
     def end_recorder(self) -> str:
         """Ends the recorder and the viewer, then what the stages have left; returns the recorder's verdict."""
         for child, grace_seconds in ((self._recorder, RECORDER_GRACE_SECONDS), (self._viewer, STAGE_GRACE_SECONDS)):
             if child is not None:
-                child.end(grace_seconds)
+                child.handle.signal_group(signal.SIGTERM)
+                child.wait(grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
@@ -171,7 +176,7 @@ class Guardian:
         if child.handle.returncode == 0 and not child.condemned and child.process in self._ready:
             deadline = time.monotonic() + RECORDED_SECONDS
             while child.process not in self._ended and time.monotonic() < deadline:
-                time.sleep(TICK_SECONDS / 5)
+                time.sleep(LOOK_SECONDS)
         if child.process not in self._ended:
             self._lose(child, child.reason(self.pulses.newest(child.process)))
 
@@ -302,7 +307,10 @@ class Guardian:
             self._say(f"{name} was {ASKED}", "info")
             self._give_up(child, ASKED)
             return None
-        absent, budget = (process.stage, process.replica) in self._absent(), self._budget(process.stage)
+        absent = (process.stage, process.replica) in self._absent()
+        # What a stage remembers is rebuilt from recorded messages, if there are any.
+        forgets = self._run.steps_only and self._run.remembers(process.stage)
+        budget = 0 if forgets else self._graph.nodes[process.stage].restarts
         if absent or child.crashes >= budget:
             self._show_output(child)
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
@@ -311,11 +319,6 @@ class Guardian:
         child.crashes += 1
         self._give_up(child, reason)
         return None
-
-    def _budget(self, stage: str) -> int:
-        """How often a process may crash. What a stage remembers is rebuilt from recorded messages, if there are any."""
-        forgets = self._run.steps_only and self._run.remembers(stage)
-        return 0 if forgets else self._graph.nodes[stage].restarts
 
     def _give_up(self, child: Child, reason: str) -> None:
         """Tells everybody that a process is dead and will be replaced."""

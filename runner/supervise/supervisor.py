@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -38,6 +39,7 @@ from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import Gateway, new_endpoint, remove_sockets
 
+R = TypeVar("R", bound=msgspec.Struct)
 EXIT_INCOMPLETE = 3
 
 
@@ -139,22 +141,27 @@ class Supervisor:
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _connect(self) -> None:
-        subscribe = self._bus.subscribe
-        subscribe("j/*", self._on_journal)
-        subscribe("l/*", self._on_log)
-        subscribe(f"m/*/{FINISHED}", self._on_finished)
-        subscribe("settled/**", partial(self._on_word, self._guardian.settled))
-        subscribe("e/**", partial(self._on_word, self._guardian.quiet))
-        subscribe("h/**", self._on_pulse)
+        self._hear("j/*", Journal, self._on_journal)
+        self._hear("l/*", LogLine, self._on_log)
+        self._hear("h/**", Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns))
+        self._hear(f"m/*/{FINISHED}", Envelope, self._on_finished)
         for key in self._calls.answer_keys:
-            subscribe(f"m/{key}", self._on_answer)
+            self._hear(f"m/{key}", Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
+        self._bus.subscribe("settled/**", partial(self._on_word, self._guardian.settled))
+        self._bus.subscribe("e/**", partial(self._on_word, self._guardian.quiet))
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
 
-    def _on_journal(self, packet: Packet) -> None:
-        journal = self._refusals.read(Journal, packet)
-        if journal is None:
-            return
+    def _hear(self, path: str, kind: type[R], note: Callable[[R, Packet], None]) -> None:
+        """Has everything noted that is sent to a path; what is not of its kind is refused."""
+
+        def take(packet: Packet) -> None:
+            if (record := self._refusals.read(kind, packet)) is not None:
+                note(record, packet)
+
+        self._bus.subscribe(path, take)
+
+    def _on_journal(self, journal: Journal, packet: Packet) -> None:
         self._delivery.answered(packet.end, journal.answered)
         for step in journal.steps:
             self._delivery.answered(step.stage, answered(step))
@@ -166,21 +173,14 @@ class Supervisor:
             elif step.outcome == "ended":
                 self._has_ended.set()
 
-    def _on_answer(self, packet: Packet) -> None:
-        envelope = self._refusals.read(Envelope, packet)
-        if envelope is not None:
-            self._calls.note_answer(envelope.id, packet.payload)
+    def _on_log(self, line: LogLine, _: Packet) -> None:
+        self._calls.note_log(line)
+        if line.stage != SUPERVISOR and line.level != "debug":
+            self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
 
-    def _on_log(self, packet: Packet) -> None:
-        line = self._refusals.read(LogLine, packet)
-        if line is not None:
-            self._calls.note_log(line)
-            if line.stage != SUPERVISOR and line.level != "debug":
-                self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
-
-    def _on_finished(self, packet: Packet) -> None:
+    def _on_finished(self, envelope: Envelope, packet: Packet) -> None:
         try:
-            finished = codec.open_envelope(Finished, codec.unpack(Envelope, packet.payload))
+            finished = codec.open_envelope(Finished, envelope)
         except CodecError as error:
             self._refusals.refuse(packet.key, error)
         else:
@@ -192,11 +192,6 @@ class Supervisor:
             named.add(Process.of(packet.key))
         except Refused as refusal:
             self._refusals.refuse(packet.key, refusal)
-
-    def _on_pulse(self, packet: Packet) -> None:
-        pulse = self._refusals.read(Pulse, packet)
-        if pulse is not None:
-            self._guardian.pulses.note(pulse, packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
