@@ -158,12 +158,15 @@ class Calls:
         self._remember(self._answers, id, payload)
 
     def note_step(self, step: Step) -> None:
-        """Takes a step that was done: the one of a command, or a later one that answers it."""
+        """Takes a step: the one of a command, or a later one that answers it; one that failed is taken again."""
         with self._changed:
             consumed = {id for _, id in step.consumed}
             for id, call in self._calls.items():
                 if call.stage == step.stage and not call.done:
-                    self._advance(id in consumed, call, step)
+                    if step.outcome == "done":
+                        self._advance(id in consumed, call, step)
+                    elif step.outcome == "failed" and id in consumed:
+                        call.lines.append(("error", step.error))
             self._changed.notify_all()
 
     def close(self) -> None:

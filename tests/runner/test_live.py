@@ -275,7 +275,7 @@ def test_a_call_that_waits_for_room_when_the_graph_ends_spoils_no_recording(tmp_
     assert str(Recording(finished.recording).verdict) == "COMPLETE", finished.output
 
 
-def test_a_call_is_done_when_every_replica_has_done_it() -> None:
+def test_a_call_is_done_when_every_replica_has_done_it_even_if_one_failed_before() -> None:
     graph = load_graph(ACCOUNT)
     graph.nodes["account"] = dataclasses.replace(graph.nodes["account"], replicas=2)
 
@@ -287,12 +287,14 @@ def test_a_call_is_done_when_every_replica_has_done_it() -> None:
     calls = Calls(graph, publish)
     id = calls.call(CallRequest("account", "add", {"amount": "1"}))
     step = Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0)
+    calls.note_step(msgspec.structs.replace(step, emitted=(), outcome="failed", error="gone"))
     calls.note_step(step)
     calls.note_log(LogLine("account", 0, "info", "half done", 1))
     assert not calls.progress(CallQuestion(id, 0)).done
     calls.note_step(msgspec.structs.replace(step, replica=1))
     done = calls.progress(CallQuestion(id, 0))
-    assert (done.done, done.emitted, done.lines) == (True, ("account.sum#0",), (("info", "half done"),))
+    assert (done.done, done.refused, done.emitted) == (True, "", ("account.sum#0",))
+    assert done.lines == (("error", "gone"), ("info", "half done"))
 
 
 def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixture[str]) -> None:
