@@ -151,11 +151,10 @@ class RemoteChild:
 
     def end(self, code: int, output: str) -> None:
         """Takes note that it has gone; its last words are kept where those of other processes are."""
-        if self.returncode is None:
-            with self._log.open("a") as log:
-                log.write(output)
-            self.returncode = code
-            self._ended.set()
+        with self._log.open("a") as log:
+            log.write(output)
+        self.returncode = code
+        self._ended.set()
 
 
 @dataclass(slots=True)
