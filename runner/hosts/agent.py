@@ -22,18 +22,14 @@ from runner.hosts.head import (
     PIECE_BYTES,
     Dismiss,
     Ended,
-    Hello,
     Order,
     Report,
     Signal,
     Start,
     Started,
-    Welcome,
-    as_written,
     control,
+    introduce,
     network_of,
-    source_of,
-    this_machine,
 )
 from runner.message.packet import Packet, Process
 from runner.process.children import Family, Handle, behind, last_lines
@@ -54,6 +50,8 @@ GONE = 1
 class _Child:
     handle: Handle
     log: Path
+    log_from: int
+    """Where its own lines begin in the log."""
 
 
 class Agent:
@@ -81,44 +79,33 @@ class Agent:
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, signal.SIG_DFL)
         own = Process(self._host, 0, self._session)
-        bus = Bus(control(name), private(self._layout.endpoint), network=self._network, process=own)
+        endpoint = private(self._layout.endpoint)
+        self._bus = Bus(control(name), endpoint, network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
         self._family = Family()
         try:
-            return self._take_part(bus)
+            return self._take_part()
         finally:
             self._end_all()
-            bus.close()
+            self._bus.close()
 
-    def _take_part(self, bus: Bus) -> Dismiss:
-        bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)
-        bus.watch(self._on_presence)
-        bus.announce()
+    def _take_part(self) -> Dismiss:
+        """Raises Refused with the head's reason where it does not take this host in."""
+        self._bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)
+        self._bus.watch(self._on_presence)
+        self._bus.announce()
         while not self._head_is_there:
             with contextlib.suppress(queue.Empty):
                 event = self._events.get(timeout=TICK_SECONDS)
                 if isinstance(event, Dismiss):
                     return event
-        folder = self._recordings / self._join(bus).run
-        (folder / "log").mkdir(parents=True, exist_ok=True)
-        return self._serve(bus, folder)
-
-    def _join(self, bus: Bus) -> Welcome:
-        """Raises Refused with the head's reason where it does not take this host in."""
-        hello = Hello(
-            host=self._host,
-            session=self._session,
-            graph=as_written(self._document),
-            folder=str(self._document.folder),
-            cwd=str(Path.cwd()),
-            fingerprint=this_machine(self._document),
-            source=source_of(self._document),
-        )
-        answer = bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS)
-        welcome = msgspec.json.decode(answer, type=Welcome)
-        self._say(f"takes part in run {welcome.run}")
-        return welcome
+        hello = introduce(self._document, self._host, self._session)
+        run = self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS).decode()
+        self._say(f"takes part in run {run}")
+        self._folder = (self._recordings / run).absolute()
+        (self._folder / "log").mkdir(parents=True, exist_ok=True)
+        return self._serve()
 
     def _on_order(self, packet: Packet) -> None:
         self._events.put(msgspec.json.decode(packet.payload, type=Order))
@@ -131,63 +118,62 @@ class Agent:
 
     # ------------------------------------------------------------------------------------------ processes
 
-    def _serve(self, bus: Bus, folder: Path) -> Dismiss:
+    def _serve(self) -> Dismiss:
         """Does what the head says until it says that it is over, or is not heard any more."""
         while True:
-            for report in self._reap():
-                bus.publish(f"report/{self._host}/{self._session}", msgspec.json.encode(report))
+            self._reap()
             with contextlib.suppress(queue.Empty):
                 match self._events.get(timeout=TICK_SECONDS):
                     case Start() as order:
-                        report = self._start(self._with_past(bus, order, folder), folder)
-                        bus.publish(f"report/{self._host}/{self._session}", msgspec.json.encode(report))
+                        self._start(order)
                     case Signal() as order:
                         self._signal(order)
                     case end:
                         return end
 
-    def _with_past(self, bus: Bus, order: Start, folder: Path) -> Start:
-        """Copies the recording here from which a stage gets its state back."""
-        if not order.task.past:
-            return order
-        path = (folder / f"{order.process.stage}-past.mcap").absolute()
-        with path.open("wb") as file:
-            while file.write(bus.ask("past", str(file.tell()).encode(), ASK_SECONDS)) == PIECE_BYTES:
-                pass
-        return msgspec.structs.replace(order, task=msgspec.structs.replace(order.task, past=str(path)))
-
-    def _start(self, order: Start, folder: Path) -> Report:
+    def _start(self, order: Start) -> None:
         process = order.process
-        own = {"directory": str(folder.absolute()), "network": self._network, "gateway": ""}
-        task = msgspec.structs.replace(order.task, **own)
-        log = folder / "log" / f"{process.stage}-{process.replica}.txt"
+        task = msgspec.structs.replace(
+            order.task,
+            directory=str(self._folder),
+            network=self._network,
+            gateway="",
+            past=self._copy_past(process.stage) if order.task.past else "",
+        )
+        log = self._folder / "log" / f"{process.stage}-{process.replica}.txt"
+        log_from = log.stat().st_size if log.exists() else 0
         name, mark = f"{process.stage}.{process.replica}", self._family.mark(process.path)
         module, data = "runner.process.stage_process", msgspec.json.encode(task)
         handle = self._forks.start(module, name, task=data, log=log, mark=mark)
-        self._children[process] = _Child(handle, log)
+        self._children[process] = _Child(handle, log, log_from)
         self._say(f"starts {name}")
-        return Started(process, handle.pid)
+        self._report(Started(process, handle.pid))
+
+    def _copy_past(self, stage: str) -> str:
+        """Copies the recording here from which a stage gets its state back."""
+        path = self._folder / f"{stage}-past.mcap"
+        with path.open("wb") as file:
+            while file.write(self._bus.ask("past", str(file.tell()).encode(), ASK_SECONDS)) == PIECE_BYTES:
+                pass
+        return str(path)
 
     def _signal(self, order: Signal) -> None:
-        child = self._children.get(order.process)
-        if child is None:
-            return
-        if order.group:
-            child.handle.signal_group(order.signum)
-        else:
-            child.handle.send_signal(order.signum)
+        if (child := self._children.get(order.process)) is not None:
+            signal_it = child.handle.signal_group if order.group else child.handle.send_signal
+            signal_it(order.signum)
 
-    def _reap(self) -> list[Report]:
-        """What has ended since, each with the last that it printed, and nothing left of what it had started."""
-        ended = [(process, child) for process, child in self._children.items() if child.handle.poll() is not None]
-        for process, _ in ended:
-            del self._children[process]
-            if left := self._family.end(process.path):
-                self._say(f"{process.stage}.{process.replica} {behind(left)}")
-        return [
-            Ended(process, child.handle.wait(), "".join(f"{line}\n" for line in last_lines(child.log, TAIL_LINES)))
-            for process, child in ended
-        ]
+    def _reap(self) -> None:
+        """Reports what has ended, with the last that it printed; nothing is left of what it had started."""
+        for process, child in list(self._children.items()):
+            if (code := child.handle.poll()) is not None:
+                del self._children[process]
+                if left := self._family.end(process.path):
+                    self._say(f"{process.stage}.{process.replica} {behind(left)}")
+                lines = last_lines(child.log, TAIL_LINES, child.log_from)
+                self._report(Ended(process, code, "".join(f"{line}\n" for line in lines)))
+
+    def _report(self, report: Report) -> None:
+        self._bus.publish(f"report/{self._host}/{self._session}", msgspec.json.encode(report))
 
     def _end_all(self) -> None:
         """Asks what is left to end, then kills it."""

@@ -3,7 +3,7 @@
 Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learns when it joins:
 
 ==========================  ======================================================================================
-``q/join``                  a host's question (:class:`Hello`), answered with :class:`Welcome` or the reason why not
+``q/join``                  a host's question (:class:`Hello`), answered with the run's id or the reason why not
 ``q/past``                  the recording so far, from an offset on: what a stateful stage lived before a restart
 ``order/HOST/SESSION``      what the host is to do (:data:`Order`); only the head may publish here
 ``report/HOST/SESSION``     what has come of it (:data:`Report`)
@@ -69,12 +69,6 @@ class Hello(msgspec.Struct, frozen=True):
     fingerprint: str
     source: str
     """Of the runner and of the stages."""
-
-
-class Welcome(msgspec.Struct, frozen=True):
-    """What a host is told when it takes part."""
-
-    run: str
 
 
 class Start(msgspec.Struct, frozen=True, tag=True):
@@ -149,23 +143,18 @@ class RemoteChild:
 
     def send_signal(self, signum: int) -> None:
         """Signals this process alone."""
-        self._signal(signum, group=False)
+        self._send(Signal(self.process, signum, group=False))
 
     def signal_group(self, signum: int) -> None:
         """Signals it and everything it has started."""
-        self._signal(signum, group=True)
+        self._send(Signal(self.process, signum, group=True))
 
     def end(self, code: int, output: str) -> None:
         """Takes note that it has gone; its last words are kept where those of other processes are."""
-        if self.returncode is None:
-            with self._log.open("a") as log:
-                log.write(output)
-            self.returncode = code
-            self._ended.set()
-
-    def _signal(self, signum: int, *, group: bool) -> None:
-        if self.returncode is None:
-            self._send(Signal(self.process, signum, group))
+        with self._log.open("a") as log:
+            log.write(output)
+        self.returncode = code
+        self._ended.set()
 
 
 @dataclass(slots=True)
@@ -177,7 +166,7 @@ class _Place:
     """Of the session that takes part now."""
     lost_at: float | None = None
     children: dict[Process, RemoteChild] = field(default_factory=dict[Process, RemoteChild])
-    waiting: list[Start] = field(default_factory=list[Start])
+    waiting: dict[Process, Start] = field(default_factory=dict[Process, Start])
     """What it is to start once it is there."""
 
 
@@ -191,7 +180,6 @@ class Hosts:
         self._document = read_document(file)
         self._say = say
         self._run = ""
-        self._closing = False
         self._places = {host: _Place(host) for host in layout.names[1:]}
         self._present: set[Process] = set()
         self._changed = threading.Condition(threading.RLock())
@@ -206,22 +194,21 @@ class Hosts:
         self._bus.serve("past", lambda offset: _read(recording, int(offset)))
         self._bus.subscribe("report/*/*", self._on_report)
         self._bus.watch(self._on_presence)
-        self._bus.serve("join", lambda text: msgspec.json.encode(self._join(msgspec.json.decode(text, type=Hello))))
+        self._bus.serve("join", lambda text: self._join(msgspec.json.decode(text, type=Hello)).encode())
         self._bus.announce()
 
     def start(self, host: str, process: Process, task: Assignment, log: Path) -> RemoteChild:
         """Has a process started, as soon as its host is there."""
+        place = self._places[host]
         child = RemoteChild(process, log, lambda order: self._order(place, order))
         with self._changed:
-            place = self._places[host]
             place.children[process] = child
             self._order(place, Start(process, task))
         return child
 
     def waits(self, process: Process) -> bool:
         """Whether a process has not been started yet, because its host is not there."""
-        with self._changed:
-            return any(start.process == process for place in self._places.values() for start in place.waiting)
+        return any(process in place.waiting for place in self._places.values())
 
     def remind(self) -> None:
         """Says from time to time which hosts are still waited for."""
@@ -245,37 +232,42 @@ class Hosts:
 
     def close(self, code: int, reason: str) -> None:
         """Sends every host home and closes the place where all meet."""
-        self._closing = True
-        for place in self._places.values():
-            self._order(place, Dismiss(code, reason))
         with self._changed:
-            self._changed.wait_for(self._all_gone, LEAVE_SECONDS)
+            for place in self._places.values():
+                self._order(place, Dismiss(code, reason))
+                place.hello = None
+            self._changed.wait_for(lambda: not self._present, LEAVE_SECONDS)
         self._bus.close()
         if self._router is not None:
             self._router.close()
 
     # ------------------------------------------------------------------------------------------ what is heard
 
-    def _join(self, hello: Hello) -> Welcome:
-        """Takes a host in, or raises Refused with the reason."""
+    def _join(self, hello: Hello) -> str:
+        """Takes a host in and returns the run's id, or raises Refused with the reason."""
         place = self._places.get(hello.host)
         if place is None:
             raise Refused(f"host {hello.host!r}: the head starts that itself{suggest(hello.host, self._places)}")
-        self._refuse_other_graph(hello)
-        own = Process(hello.host, 0, hello.session)
+        own = introduce(self._document, self.network.host, 0)
+        _refuse_other_graph(own, hello)
+        process = Process(hello.host, 0, hello.session)
         with self._changed:
-            if not self._changed.wait_for(lambda: own in self._present, JOIN_SECONDS):
+            if not self._changed.wait_for(lambda: process in self._present, JOIN_SECONDS):
                 raise Refused(f"host {hello.host} was not seen for {JOIN_SECONDS:g} s; start it again")
             if place.hello is not None:
                 raise Refused(f"host {hello.host} takes part already; valid: one `runner up` a host")
             back = place.lost_at is not None
             place.hello, place.lost_at = hello, None
-            waiting, place.waiting = place.waiting, []
-            for start in waiting:
+            for start in place.waiting.values():
                 self._order(place, start)
+            place.waiting.clear()
         self._say(f"host {hello.host} is {'back' if back else 'there'}", "info")
-        self._compare_machines(hello)
-        return Welcome(self._run)
+        if hello.source != own.source:
+            self._say(f"host {hello.host} has {hello.source}, the head {own.source}", "warning")
+        if hello.fingerprint != own.fingerprint:
+            floats = "floats may differ in their last bits"
+            self._say(f"host {hello.host} has another processor or other libraries: {floats}", "warning")
+        return self._run
 
     def _on_presence(self, process: Process, present: bool) -> None:
         place = self._places.get(process.stage)
@@ -284,11 +276,7 @@ class Hosts:
         with self._changed:
             (self._present.add if present else self._present.discard)(process)
             self._changed.notify_all()
-            if (
-                place.hello is not None
-                and place.hello.session == process.incarnation
-                and not (present or self._closing)
-            ):
+            if not present and place.hello is not None and place.hello.session == process.incarnation:
                 self._lose(place)
 
     def _on_report(self, packet: Packet) -> None:
@@ -297,13 +285,12 @@ class Hosts:
         with self._changed:
             if place is None or place.hello is None or str(place.hello.session) != session:
                 return
-            match msgspec.json.decode(packet.payload, type=Report):
-                case Started(process, pid) if process in place.children:
+            report: Report = msgspec.json.decode(packet.payload, type=Report)
+            match report:
+                case Started(process, pid):
                     place.children[process].pid = pid
-                case Ended(process, code, output) if process in place.children:
+                case Ended(process, code, output):
                     place.children.pop(process).end(code, output)
-                case _:
-                    pass
 
     def _lose(self, place: _Place) -> None:
         """Counts everything on a host as gone; what cannot be started elsewhere is started when it is back."""
@@ -318,68 +305,48 @@ class Hosts:
     def _order(self, place: _Place, order: Order) -> None:
         """Sends an order; one to start a process waits for its host, and is withdrawn by a signal."""
         with self._changed:
-            hello = place.hello
-            if hello is not None:
+            if place.hello is not None:
                 if isinstance(order, Start):
-                    order = Start(order.process, self._moved(order.task, hello))
-                self._bus.publish(f"order/{place.name}/{hello.session}", msgspec.json.encode(order))
+                    order = Start(order.process, self._moved(order.task, place.hello))
+                self._bus.publish(f"order/{place.name}/{place.hello.session}", msgspec.json.encode(order))
             elif isinstance(order, Start):
-                place.waiting.append(order)
-            elif isinstance(order, Signal):
-                self._cancel(place, order.process)
-
-    def _cancel(self, place: _Place, process: Process) -> None:
-        place.waiting = [start for start in place.waiting if start.process != process]
-        child = place.children.pop(process, None)
-        if child is not None:
-            child.end(0, "")
+                place.waiting[order.process] = order
+            elif isinstance(order, Signal) and order.process in place.children:
+                place.waiting.pop(order.process, None)
+                place.children.pop(order.process).end(0, "")
 
     def _moved(self, task: Assignment, hello: Hello) -> Assignment:
         """Paths below the folders of the head become paths below those of the host."""
         folders = {str(self._document.folder): hello.folder, str(Path.cwd()): hello.cwd}
         return msgspec.structs.replace(task, entry=moved(task.entry, folders))
 
-    def _refuse_other_graph(self, hello: Hello) -> None:
-        """All hosts must mean the same graph; settings are the head's alone and reach them with their tasks."""
-        theirs, own = msgspec.json.decode(hello.graph), msgspec.json.decode(as_written(self._document))
-        found = list(differences(own, theirs))
-        if found:
-            shown = [f"{key}: {there} at {hello.host}, {here} at the head" for key, here, there in found]
-            more = f" and {len(found) - SHOWN_DIFFERENCES} more" if len(found) > SHOWN_DIFFERENCES else ""
-            raise Refused(
-                f"host {hello.host} has another graph: {'; '.join(shown[:SHOWN_DIFFERENCES])}{more}; "
-                f"copy the head's file to it"
-            )
 
-    def _compare_machines(self, hello: Hello) -> None:
-        """Says where results may depend on which host computed them."""
-        if hello.source != (own := source_of(self._document)):
-            self._say(f"host {hello.host} has {hello.source}, the head {own}", "warning")
-        if hello.fingerprint != this_machine(self._document):
-            self._say(
-                f"host {hello.host} has another processor or other libraries: floats may differ in their last bits",
-                "warning",
-            )
-
-    def _all_gone(self) -> bool:
-        return not self._present
-
-
-def this_machine(document: Document) -> str:
-    """Hash over what floats depend on here."""
+def introduce(document: Document, host: str, session: int) -> Hello:
+    """What a host says of itself: of its graph file without the changes of the command line."""
+    written = read_document(Path(document.label)).values
     named = document.values.get("numerical")
     names = map(str, cast("list[Any]", named)) if isinstance(named, list) else NUMERICAL
-    return fingerprint(machine(), package_versions(), names)
+    return Hello(
+        host=host,
+        session=session,
+        graph=msgspec.json.encode(written, enc_hook=str).decode(),
+        folder=str(document.folder),
+        cwd=str(Path.cwd()),
+        fingerprint=fingerprint(machine(), package_versions(), names),
+        source=f"runner {runner_version()}, stages {revision(document.values) or 'of unknown revision'}",
+    )
 
 
-def source_of(document: Document) -> str:
-    """What of the runner and of a graph's stages is here, in words."""
-    return f"runner {runner_version()}, stages {revision(document.values) or 'of unknown revision'}"
-
-
-def as_written(document: Document) -> str:
-    """JSON of a graph file without the changes of the command line."""
-    return msgspec.json.encode(read_document(Path(document.label)).values, enc_hook=str).decode()
+def _refuse_other_graph(own: Hello, hello: Hello) -> None:
+    """All hosts must mean the same graph; settings are the head's alone and reach them with their tasks."""
+    found = list(differences(msgspec.json.decode(own.graph), msgspec.json.decode(hello.graph)))
+    if found:
+        shown = [f"{key}: {there} at {hello.host}, {here} at the head" for key, here, there in found]
+        more = f" and {len(found) - SHOWN_DIFFERENCES} more" if len(found) > SHOWN_DIFFERENCES else ""
+        raise Refused(
+            f"host {hello.host} has another graph: {'; '.join(shown[:SHOWN_DIFFERENCES])}{more}; "
+            f"copy the head's file to it"
+        )
 
 
 def differences(own: Any, theirs: Any, key: str = "") -> Iterator[tuple[str, str, str]]:

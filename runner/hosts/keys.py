@@ -15,9 +15,9 @@ import contextlib
 import datetime
 import ipaddress
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TypeVar
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -27,6 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from runner.contract import Refused
 from runner.graph.placement import READER, Credentials, Host
 
+T = TypeVar("T")
 Extension = tuple[x509.ExtensionType, bool]
 """What a certificate says beside names and dates, and whether who does not understand it must refuse."""
 Signed = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
@@ -45,9 +46,8 @@ def make_keys(folder: Path, hosts: Sequence[Host]) -> None:
             f"{folder}: there are keys already and they are not overwritten; "
             f"valid: another folder, or `runner keys add --keys {folder} NAME=ADDRESS` for one more host"
         )
-    _make_folder(folder)
     authority = _sign(AUTHORITY, days=CA_DAYS, extensions=_AUTHORITY)
-    _write_pair(folder / "ca.pem", folder / "ca-key.pem", authority)
+    _write(folder, {"ca.pem": _pem(authority), "ca-key.pem": _key_pem(authority)})
     _add(folder, authority, [*hosts, Host(READER, "localhost")])
 
 
@@ -121,11 +121,8 @@ def _add(folder: Path, authority: Signed, hosts: Sequence[Host]) -> None:
     if taken:
         raise Refused(f"{folder / taken[0]}: is there already and is not overwritten; remove it to make another")
     for host in hosts:
-        own = folder / host.name
-        _make_folder(own)
         signed = _sign(host.name, days=HOST_DAYS, extensions=_extensions(host), by=authority)
-        _write_pair(own / "cert.pem", own / "key.pem", signed)
-        _write(own / "ca.pem", authority[0].public_bytes(serialization.Encoding.PEM))
+        _write(folder / host.name, {"ca.pem": _pem(authority), "cert.pem": _pem(signed), "key.pem": _key_pem(signed)})
 
 
 def _extensions(host: Host) -> list[Extension]:
@@ -150,51 +147,44 @@ def _name(text: str) -> x509.Name:
 # ---------------------------------------------------------------------------------------------- files
 
 
-def _write_pair(certificate: Path, key: Path, signed: Signed) -> None:
-    _write(certificate, signed[0].public_bytes(serialization.Encoding.PEM))
-    private = signed[1].private_bytes(
+def _pem(signed: Signed) -> bytes:
+    return signed[0].public_bytes(serialization.Encoding.PEM)
+
+
+def _key_pem(signed: Signed) -> bytes:
+    return signed[1].private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    _write(key, private)
 
 
-def _make_folder(folder: Path) -> None:
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """New files that only their owner reads, from the first byte on, in a folder that only he enters."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name, data in files.items():
+            with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(data)
     except OSError as error:
-        raise Refused(f"{folder}: {error.strerror}") from None
-
-
-def _write(path: Path, data: bytes) -> None:
-    """A new file that only its owner reads, from the first byte on."""
-    try:
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(data)
-    except OSError as error:
-        raise Refused(f"{path}: {error.strerror}") from None
+        raise Refused(f"{error.filename or folder}: {error.strerror}") from None
 
 
 def _read_certificate(path: Path) -> x509.Certificate:
-    try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
-    except OSError as error:
-        raise Refused(f"{path}: {error.strerror}{_hint(path)}") from None
-    except ValueError:
-        raise Refused(f"{path}: is no certificate") from None
+    return _read(path, x509.load_pem_x509_certificate, "certificate")
 
 
 def _read_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    try:
-        key = cast("Any", serialization.load_pem_private_key(path.read_bytes(), None))
-    except OSError as error:
-        raise Refused(f"{path}: {error.strerror}{_hint(path)}") from None
-    except (ValueError, TypeError):
-        raise Refused(f"{path}: is no private key") from None
+    key = _read(path, lambda data: serialization.load_pem_private_key(data, None), "private key")
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise Refused(f"{path}: is not a key that `runner keys` made")
     return key
 
 
-def _hint(path: Path) -> str:
-    name = path.parent.name
-    return f"; make keys with `runner keys init`, and copy the folder {name} to the machine that is {name}"
+def _read(path: Path, parse: Callable[[bytes], T], what: str) -> T:
+    try:
+        return parse(path.read_bytes())
+    except OSError as error:
+        name = path.parent.name
+        hint = f"make keys with `runner keys init`, and copy the folder {name} to the machine that is {name}"
+        raise Refused(f"{path}: {error.strerror}; {hint}") from None
+    except (ValueError, TypeError):
+        raise Refused(f"{path}: is no {what}") from None

@@ -14,7 +14,7 @@ POLL_SECONDS = 0.1
 PATIENCE_SECONDS = 30.0
 """A publisher that is held back for longer says so."""
 
-Publish = Callable[[str, bytes], None]
+Publish = Callable[[str, bytes | bytearray], None]
 """Sends a payload under a key."""
 Warn = Callable[[str], None]
 
@@ -117,7 +117,7 @@ class Delivery:
             for edge in self._edges_to(consumer, port):
                 edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
 
-    def publish(self, port: str, envelope: Envelope, payload: bytes) -> None:
+    def publish(self, port: str, envelope: Envelope, payload: bytes | bytearray) -> None:
         """Sends a message once every consumer of a port has room, and deals it.
 
         Raises Stopped where the graph ends meanwhile; it is sent then too.

@@ -69,23 +69,6 @@ class Heart:
         )
 
 
-class Pulses:
-    """The newest pulse of every process."""
-
-    def __init__(self) -> None:
-        self.newest: dict[tuple[str, int], Pulse] = {}
-        """By (stage, replica); the recorder is ("recorder", 0)."""
-
-    def note(self, pulse: Pulse) -> None:
-        """Takes a pulse as it comes."""
-        self.newest[pulse.stage, pulse.replica] = pulse
-
-    def of(self, process: Process) -> Pulse | None:
-        """The newest of one incarnation."""
-        pulse = self.newest.get((process.stage, process.replica))
-        return pulse if pulse is not None and pulse.incarnation == process.incarnation else None
-
-
 class Watch:
     """What the supervisor concludes of one process from its pulses or their absence."""
 

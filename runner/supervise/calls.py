@@ -7,11 +7,10 @@ import inspect
 import itertools
 import textwrap
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import yaml
@@ -23,6 +22,7 @@ from runner.graph.ports import port_name
 from runner.message.codec import LogLine, Step
 from runner.message.ids import MessageId
 
+T = TypeVar("T")
 KEPT = 100
 """Calls that may still be asked about."""
 PATIENCE_SECONDS = 5.0
@@ -79,8 +79,8 @@ class Progress(msgspec.Struct, frozen=True):
     """The envelope of the answer, where the command has one."""
 
 
-Publish = Callable[[str, Command, Callable[[str], None]], None]
-"""Sends a command on an output port of the supervisor, and says under which id before it does."""
+Publish = Callable[[str, Command, Callable[[str], None]], str]
+"""Sends a command on an output port of the supervisor; returns its id, and says it before it sends."""
 
 
 @dataclass(slots=True)
@@ -115,39 +115,34 @@ class Calls:
 
     def types(self) -> list[CommandType]:
         """Every command of the graph."""
-        return [kind for node in self._graph.nodes.values() for kind in command_types(node)]
+        return [
+            _command_type(node, name, kind)
+            for node in self._graph.nodes.values()
+            for name, kind in node.type.commands.items()
+        ]
 
     def call(self, request: CallRequest) -> str:
         """Publishes a command and returns its id; raises Refused naming the valid ones where it breaks its type."""
         kind = _find(self._graph, request)
         command = read_command(f"{request.stage} {request.command}", kind, request.arguments)
-        own, replicas = "", set(range(self._graph.nodes[request.stage].replicas))
-
-        def note(id: str) -> None:
-            nonlocal own
-            own = id
-            with self._changed:
-                self._calls[id] = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
-                while len(self._calls) > KEPT:
-                    self._calls.popitem(last=False)
-
-        self._publish(command_port(request.stage, request.command), command, note)
-        return own
+        replicas = set(range(self._graph.nodes[request.stage].replicas))
+        call = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
+        port = command_port(request.stage, request.command)
+        return self._publish(port, command, lambda id: self._remember(self._calls, id, call))
 
     def progress(self, question: CallQuestion) -> Progress:
         """Waits for news of a call, but not for long."""
-        deadline = time.monotonic() + PATIENCE_SECONDS
         with self._changed:
             call = self._calls.get(question.id)
             if call is None:
                 raise Refused(f"{question.id}: no such call; the newest {KEPT} are remembered")
-            while not (call.done or len(call.lines) > question.since) and time.monotonic() < deadline:
-                if self._closed:
-                    raise Refused("the graph ended before it was done")
-                self._changed.wait(0.1)
-            error = call.step.error if call.step else ""
-            emitted = call.step.emitted if call.step else ()
+            self._changed.wait_for(
+                lambda: self._closed or call.done or len(call.lines) > question.since, PATIENCE_SECONDS
+            )
             lines = tuple(call.lines[question.since :])
+            if self._closed and not (call.done or lines):
+                raise Refused("the graph ended before it was done")
+            error, emitted = (call.step.error, call.step.emitted) if call.step else ("", ())
             return Progress(lines, call.done, error.removeprefix("Refused: "), emitted, call.payload)
 
     def note_log(self, line: LogLine) -> None:
@@ -160,18 +155,18 @@ class Calls:
 
     def note_answer(self, id: str, payload: bytes) -> None:
         """Takes a message that may answer a call, before the step that emitted it."""
-        with self._changed:
-            self._answers[id] = payload
-            while len(self._answers) > KEPT:
-                self._answers.popitem(last=False)
+        self._remember(self._answers, id, payload)
 
     def note_step(self, step: Step) -> None:
-        """Takes a step that was done: the one of a command, or a later one that answers it."""
+        """Takes a step: the one of a command, or a later one that answers it; one that failed is taken again."""
         with self._changed:
             consumed = {id for _, id in step.consumed}
             for id, call in self._calls.items():
                 if call.stage == step.stage and not call.done:
-                    self._advance(id in consumed, call, step)
+                    if step.outcome == "done":
+                        self._advance(id in consumed, call, step)
+                    elif step.outcome == "failed" and id in consumed:
+                        call.lines.append(("error", step.error))
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -179,6 +174,12 @@ class Calls:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+    def _remember(self, kept: OrderedDict[str, T], id: str, value: T) -> None:
+        with self._changed:
+            kept[id] = value
+            if len(kept) > KEPT:
+                kept.popitem(last=False)
 
     def _advance(self, own: bool, call: _Call, step: Step) -> None:
         if own:
@@ -192,11 +193,6 @@ class Calls:
 
 
 # ------------------------------------------------------------------------------------------ types of commands
-
-
-def command_types(node: Node) -> list[CommandType]:
-    """The commands of one stage."""
-    return [_command_type(node, name, kind) for name, kind in node.type.commands.items()]
 
 
 def read_command(place: str, kind: type[Command], arguments: Mapping[str, str]) -> Command:

@@ -1,20 +1,20 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
+import contextlib
 import signal
-import time
+import subprocess
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from runner.graph.graph import Limits
+from runner.graph.graph import Limits, Route
 from runner.message.codec import Pulse, Step, answered
 from runner.message.ids import MessageId
 from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, gigabytes, oom_kills
 
-LOOK_SECONDS = 0.01
 REMEMBERED = 10_000
 """Messages of which it is known that a stage has done with them."""
 RESENT = 1000
@@ -28,12 +28,8 @@ class Child:
     process: Process
     handle: Handle
     log: Path
-    started: float = field(default_factory=time.monotonic)
-    announced: bool = False
-    ready_after: float = 0.0
-    """Seconds from its start."""
     crashes: int = 0
-    """How often this process has crashed before, whatever else it was restarted for."""
+    """How often it and its predecessors have, whatever else they were restarted for."""
     restarted_because: str = ""
     """Why its predecessor ended."""
     retires_by: float | None = None
@@ -46,8 +42,8 @@ class Child:
     condemned: str = ""
     """Why the supervisor kills it."""
     dies_at: float = float("inf")
-    successor: tuple[str, int] | None = None
-    """Once it is dead: why it is replaced, and how often it has crashed by now."""
+    replaced_because: str = ""
+    """Once it is dead and another is to take its place."""
     dead_since: float = float("inf")
     """When it was found dead before it was seen."""
     reported: bool = False
@@ -59,26 +55,33 @@ class Child:
         """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
         if self.condemned:
             return self.condemned
-        code = self.handle.returncode
-        lines = last_lines(self.log, 1, self.log_from)
-        if lines and code is not None and code >= 0:
+        code = self.handle.returncode or 0
+        if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
             return lines[0]
+        if code != -signal.SIGKILL or oom_kills() == self.oom_kills:
+            return ending(code)
         held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
-        out_of_memory = code == -signal.SIGKILL and oom_kills() > self.oom_kills
-        return f"{ending(code or 0)}{f': the kernel was out of memory{held}' if out_of_memory else ''}"
+        return f"{ending(code)}: the kernel was out of memory{held}"
+
+    def wait(self, seconds: float) -> None:
+        """Waits for its end, and kills it where that does not come, and whatever it has left behind."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.handle.wait(seconds)
+        self.handle.signal_group(signal.SIGKILL)
+        self.handle.wait()
 
 
 class Progress:
     """How far a stage has come: what its next process must know."""
 
-    def __init__(self, shared: frozenset[tuple[str, str, str]]):
-        """``shared`` are the (output, consumer, port) of edges whose messages are dealt to replicas."""
+    def __init__(self, routes: Iterable[Route]):
+        """``routes`` are the edges that leave the stage."""
         self.numbers: dict[str, int] = {}
         """Next sequence number by output port."""
         self.started = False
         self.undone: dict[tuple[str, str, str], None] = {}
         """(consumer, port, id) of parts that were sent and not done with."""
-        self._shared = shared
+        self._shared = [route for route in routes if route.shared]
         self._consumed: OrderedDict[tuple[str, str], None] = OrderedDict()
 
     @property
@@ -102,29 +105,6 @@ class Progress:
         for id in step.emitted:
             one = MessageId.of(id)
             self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
-            for output, consumer, input in self._shared:
-                if output == one.port and not consumers[consumer].has_done(input, id):
-                    self.undone[consumer, input, id] = None
-
-
-def signal_all(children: Iterable[Child], signum: signal.Signals) -> None:
-    """Signals processes with all that they have started."""
-    for child in children:
-        child.handle.signal_group(signum)
-
-
-def wait_for(children: Iterable[Child], seconds: float, enough: Callable[[Child], bool] = lambda _: False) -> None:
-    """Waits until each has ended, or where that is ``enough``; not for longer than some seconds."""
-    deadline = time.monotonic() + seconds
-    for child in children:
-        while child.handle.poll() is None and not enough(child) and time.monotonic() < deadline:
-            time.sleep(LOOK_SECONDS)
-
-
-def end_all(children: Sequence[Child], grace_seconds: float) -> None:
-    """Asks children to end, kills those that do not, and whatever they have left behind."""
-    signal_all(children, signal.SIGTERM)
-    wait_for(children, grace_seconds)
-    signal_all(children, signal.SIGKILL)
-    for child in children:
-        child.handle.wait()
+            for route in self._shared:
+                if route.output == one.port and not consumers[route.consumer].has_done(route.input, id):
+                    self.undone[route.consumer, route.input, id] = None

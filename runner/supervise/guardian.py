@@ -7,19 +7,18 @@ from dataclasses import dataclass
 
 from runner.contract import Level, Refused, Restarted
 from runner.graph.document import suggest
-from runner.graph.graph import SUPERVISOR, Graph
+from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
-from runner.message.codec import Pulse, Step, answered
+from runner.message.codec import Step, answered
 from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, last_lines
 from runner.process.fork_server import ForkServer
-from runner.process.health import Pulses, Watch
+from runner.process.health import Watch
 from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
-from runner.supervise.child import Child, Progress, end_all, signal_all, wait_for
+from runner.supervise.child import Child, Progress
 from runner.supervise.launch import Launcher, Run
-from runner.supervise.status import ProcessStatus, Rates
+from runner.supervise.status import ProcessStatus, Pulses
 from runner.terminal import Terminal
-from runner.transport.presence import Presence
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
@@ -33,6 +32,8 @@ RECORDER_GRACE_SECONDS = 30.0
 """What the recorder may take to write what waits for the disk."""
 TICK_SECONDS = 0.05
 """Between two looks at the processes."""
+LOOK_SECONDS = 0.01
+"""The same at the end, when somebody waits."""
 DUMP_SECONDS = 0.5
 """What a hung process gets to print where it hangs before it is killed."""
 SETTLE_SECONDS = 30.0
@@ -62,7 +63,7 @@ class Guardian:
         forks: ForkServer,
         *,
         say: Callable[[str, Level], None],
-        announce: Callable[[Restarted], None],
+        announce: Callable[[Restarted], object],
         declare_lost: Callable[[Process, str], None],
     ):
         """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced, and
@@ -78,25 +79,30 @@ class Guardian:
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
-        self._progress = {stage: Progress(_shared(run.graph, stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
-        self._presence = Presence()
-        self._pulses = Pulses()
-        self._rates = Rates()
-        self._settled: set[Process] = set()
-        """Dead processes of which the recorder has everything."""
-        self._quiet: set[Process] = set()
-        """Those that publish no messages any more."""
+        self._progress = {stage: Progress(run.graph.routes(stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
+        self.pulses = Pulses()
+        """Signs of life; whoever hears one notes it."""
+        self.settled: set[Process] = set()
+        """Dead processes of which the recorder says that it has all that they have sent."""
+        self.quiet: set[Process] = set()
+        """Processes that say that they publish no messages any more."""
         self._ended: set[Process] = set()
         """Those that have journalled their end."""
-        self._absent = set(run.graph.processes())
-        self._was_ready = False
+        self._started: dict[Process, float] = {}
+        """When each was begun to be started, monotonic seconds: it may be there before that has come to its end."""
+        self._ready: dict[Process, float] = {}
+        """Seconds from its start until it was there, of those that have been."""
 
     # ------------------------------------------------------------------------------------------ from start to end
 
     def start_recorder(self, *, view: bool) -> None:
         """Starts the recorder and, once there is a recording, the viewer if wanted."""
-        self._recorder = self._launch.recorder()
-        while view and not (self._run.recording.exists() or self._recorder_died()):
+        process = Process(RECORDER, 0)
+        self._started[process] = time.monotonic()
+        self._recorder = self._launch.recorder(process)
+        while view and not self._run.recording.exists():
+            if self._recorder.handle.poll() is not None:
+                return
             time.sleep(TICK_SECONDS)
         if view:
             self._viewer = self._launch.viewer()
@@ -111,15 +117,15 @@ class Guardian:
         """Kills what hangs and replaces what has died; returns why the graph ends where that is not possible."""
         if self._recorder is not None:
             self._check(self._recorder)
-            if self._recorder_died():
+            if self._recorder.handle.poll() is not None:
                 return End(1, f"the recorder {self._recorder.reason()}")
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
-            elif not child.announced and time.monotonic() < child.dead_since + SEEN_SECONDS:
+            elif child.process not in self._ready and time.monotonic() < child.dead_since + SEEN_SECONDS:
                 child.dead_since = min(child.dead_since, time.monotonic())  # it may have been ready, and not seen yet
-            elif child.successor is not None:
-                self._start_successor(child, *child.successor)
+            elif child.replaced_because:
+                self._start_successor(child)
             elif (end := self._replace(child)) is not None:
                 return end
         return None if self._hosts is None else self._look_after_hosts(self._hosts)
@@ -127,32 +133,38 @@ class Guardian:
     def name_the_dead(self) -> None:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
-            if child.handle.poll() and child.successor is None:
-                reason = child.reason(self._pulses.of(child.process))
-                self._say(f"{self._name(child.process)} died meanwhile: {reason}", "warning")
+            if child.handle.poll() and not child.replaced_because:
+                reason = child.reason(self.pulses.newest(child.process))
+                self._say(f"{self._run.name_of(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
     def end(self) -> None:
         """Ends the stages: each says what it leaves once nobody publishes any more. Says which are killed."""
         children = list(self._children.values())
-        signal_all(children, signal.SIGTERM)
-        wait_for(children, STAGE_GRACE_SECONDS, lambda child: child.process in self._quiet)
         for child in children:
-            if child.handle.poll() is None and child.process not in self._quiet:
-                child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
-                child.handle.signal_group(signal.SIGKILL)
-                child.handle.wait()
-            self._report_lost(child)
-        wait_for(children, END_GRACE_SECONDS)
-        signal_all(children, signal.SIGKILL)
+            child.handle.signal_group(signal.SIGTERM)
+        deadline = time.monotonic() + STAGE_GRACE_SECONDS
+        while time.monotonic() < deadline and any(map(self._publishes, children)):
+            time.sleep(LOOK_SECONDS)
+        for child in filter(self._publishes, children):
+            child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
+            child.wait(0)
         for child in children:
-            child.handle.wait()
             self._report_lost(child)
+        deadline = time.monotonic() + END_GRACE_SECONDS
+        for child in children:
+            child.wait(deadline - time.monotonic())
+            self._report_lost(child)
+
+    def _publishes(self, child: Child) -> bool:
+        return child.handle.poll() is None and child.process not in self.quiet
 
     def end_recorder(self) -> str:
         """Ends the recorder and the viewer, then what the stages have left; returns the recorder's verdict."""
-        end_all([self._recorder] if self._recorder else [], RECORDER_GRACE_SECONDS)
-        end_all([self._viewer] if self._viewer else [], STAGE_GRACE_SECONDS)
+        for child, grace_seconds in ((self._recorder, RECORDER_GRACE_SECONDS), (self._viewer, STAGE_GRACE_SECONDS)):
+            if child is not None:
+                child.handle.signal_group(signal.SIGTERM)
+                child.wait(grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
@@ -161,12 +173,12 @@ class Guardian:
         """Says that a process has ended without having journalled that."""
         if child.handle.poll() is None or child.reported:
             return
-        if child.handle.returncode == 0 and not child.condemned and child.announced:
+        if child.handle.returncode == 0 and not child.condemned and child.process in self._ready:
             deadline = time.monotonic() + RECORDED_SECONDS
             while child.process not in self._ended and time.monotonic() < deadline:
-                time.sleep(TICK_SECONDS / 5)
+                time.sleep(LOOK_SECONDS)
         if child.process not in self._ended:
-            self._lose(child, child.reason(self._pulses.of(child.process)))
+            self._lose(child, child.reason(self.pulses.newest(child.process)))
 
     def _lose(self, child: Child, reason: str) -> None:
         child.reported = True
@@ -188,114 +200,92 @@ class Guardian:
             if (edge := self._graph.nodes[step.stage].inputs.get(port)) is not None:
                 self._progress[edge.stage].undone.pop((step.stage, port, id), None)
 
-    def note_quiet(self, process: Process) -> None:
-        """Takes note of a process that publishes no more."""
-        self._quiet.add(process)
-
-    def note_pulse(self, pulse: Pulse, arrived_ns: int) -> None:
-        """Takes a sign of life."""
-        self._pulses.note(pulse)
-        self._rates.note(pulse, arrived_ns)
-
-    def note_settled(self, process: Process) -> None:
-        """Takes the recorder's word that it has all that a dead process has sent."""
-        self._settled.add(process)
-
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""
-        self._presence.update(process, present)
-        child = self._children.get((process.stage, process.replica))
         if not present:
+            child = self._children.get((process.stage, process.replica))
             if self._hosts is not None and child is not None and child.process == process:
                 child.unheard_since = time.monotonic()
-            return
-        if self._recorder is not None and process == self._recorder.process:
-            self._recorder.announced = True
-        elif child is not None and child.process == process:
-            child.ready_after = time.monotonic() - child.started
-            child.announced = True
-            self._terminal.show(self._name(process), f"ready after {child.ready_after:.1f} s")
-            self._absent.discard((process.stage, process.replica))
-        else:
-            return
-        self._say_when_all_are_ready()
-
-    def _say_when_all_are_ready(self) -> None:
-        if not self._was_ready and not self.awaited():
-            self._was_ready = True
-            self._terminal.show(SUPERVISOR, f"all {len(self._children)} processes are ready")
+        elif process in self._started and process not in self._ready:
+            awaited = self.awaited()
+            self._ready[process] = time.monotonic() - self._started[process]
+            if process.stage != RECORDER:
+                self._terminal.show(self._run.name_of(process), f"ready after {self._ready[process]:.1f} s")
+            if awaited and not self.awaited():
+                self._terminal.show(SUPERVISOR, f"all {len(self._graph.processes())} processes are ready")
 
     # ------------------------------------------------------------------------------------------ what is asked
 
     def awaited(self) -> list[str]:
         """Names of those who must hear what is published and have never been ready, then the recorder; none: ready."""
-        if absent := list(self._absent):  # which another thread may change
-            return sorted(self._run.name_of(*key) for key in absent)
-        return [] if self._presence.wait_for([(RECORDER, 0)], lambda: True) else [RECORDER]
+        if absent := self._absent():
+            return sorted(self._run.name_of(Process(*key)) for key in absent)
+        return [] if Process(RECORDER, 0) in self._ready else [RECORDER]
+
+    def _absent(self) -> list[tuple[str, int]]:
+        """(stage, replica) of which no process has ever been ready."""
+        ready = {(process.stage, process.replica) for process in list(self._ready)}  # which another thread may change
+        return [key for key in self._graph.processes() if key not in ready]
 
     def restart(self, name: str, ended: Callable[[], bool]) -> str:
         """Asks one process to finish and waits for its successor; returns what to tell the user.
 
         Raises Refused where there is no such process, or the graph has ``ended`` meanwhile.
         """
-        found = {self._run.name_of(*key): key for key in self._graph.processes()}
+        found = {self._run.name_of(Process(*key)): key for key in self._graph.processes()}
         if name not in found:
             raise Refused(f"no process {name!r}{suggest(name, found)}")
         old = self._children.get(found[name])
-        if old is None or not old.announced:
+        if old is None or old.process not in self._ready:
             raise Refused(f"{name} is not ready yet")
         old.retires_by = time.monotonic() + RETIRE_SECONDS
         old.handle.send_signal(signal.SIGUSR1)
-        while (new := self._children[found[name]]) is old or not new.announced:
+        while (new := self._children[found[name]]) is old or new.process not in self._ready:
             if ended():
                 raise Refused(f"the graph ended before {name} was back")
             time.sleep(TICK_SECONDS)
-        return f"{name} is back: process {new.handle.pid}, ready after {new.ready_after:.1f} s"
+        return f"{name} is back: process {new.handle.pid}, ready after {self._ready[new.process]:.1f} s"
 
     def status(self) -> tuple[ProcessStatus, ...]:
         """How every process is, the recorder first."""
-        return tuple(map(self._status_of, [*filter(None, [self._recorder]), *list(self._children.values())]))
+        return tuple(map(self._status_of, filter(None, (self._recorder, *self._children.values()))))
 
     def _status_of(self, child: Child) -> ProcessStatus:
         process = child.process
-        pulse = self._pulses.of(process)
-        state = self._rates.state(process.stage, process.replica) if pulse and child.announced else "starting"
+        state = self.pulses.state(process) if process in self._ready else "starting"
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
-            name=self._name(process),
+            name=self._run.name_of(process),
             state=state if child.handle.poll() is None else "ended",
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
-            pulse=pulse,
-            cpu=self._rates.cpu(process.stage, process.replica),
-            steps_per_second=self._rates.steps(process.stage, process.replica),
-            sent=self._rates.sent(process.stage, process.replica),
+            pulse=self.pulses.newest(process),
+            **self.pulses.rates(process),
         )
 
     # ------------------------------------------------------------------------------------------ care
 
     def _start(self, process: Process) -> Child:
+        self._started[process] = time.monotonic()
         return self._launch.stage(process, self._progress[process.stage])
-
-    def _recorder_died(self) -> bool:
-        return self._recorder is not None and self._recorder.handle.poll() is not None
 
     def _look_after_hosts(self, hosts: Hosts) -> End | None:
         """Says who is waited for; ends the graph where one that is needed stays away."""
         for child in self._children.values():
             if hosts.waits(child.process):
-                child.started, child.watch = time.monotonic(), Watch(self._graph.nodes[child.process.stage].limits)
+                self._started[child.process] = time.monotonic()
+                child.watch = Watch(self._graph.nodes[child.process.stage].limits)
         hosts.remind()
         reason = hosts.overdue(self._graph.hosts_of_stages())
         return None if reason is None else End(1, reason)
 
     def _check(self, child: Child) -> None:
         """Kills a process that hangs or has grown too large, after it has said where it is."""
-        now, name, pulse = time.monotonic(), self._name(child.process), self._pulses.of(child.process)
+        now, name, pulse = time.monotonic(), self._run.name_of(child.process), self.pulses.newest(child.process)
         waits = child is self._recorder and pulse is not None  # for all others, and is ready after them
-        change = child.watch.look(now, pulse, ready=child.announced or waits)
+        change = child.watch.look(now, pulse, ready=child.process in self._ready or waits)
         if change:
             self._say(f"{name} {change}", "warning")
         if not child.condemned and (fault := child.watch.fault()):
@@ -309,52 +299,44 @@ class Guardian:
 
     def _replace(self, child: Child) -> End | None:
         """Has a dead process replaced within its budget; otherwise says why the graph ends."""
-        process, name = child.process, self._name(child.process)
-        reason = child.reason(self._pulses.of(process))
+        process, name = child.process, self._run.name_of(child.process)
+        reason = child.reason(self.pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
         if child.retires_by is not None and not child.condemned:
             self._say(f"{name} was {ASKED}", "info")
-            self._give_up(child, ASKED, child.crashes)
+            self._give_up(child, ASKED)
             return None
-        absent, budget = (process.stage, process.replica) in self._absent, self._budget(process.stage)
+        absent = (process.stage, process.replica) in self._absent()
+        # What a stage remembers is rebuilt from recorded messages, if there are any.
+        forgets = self._run.steps_only and self._run.remembers(process.stage)
+        budget = 0 if forgets else self._graph.nodes[process.stage].restarts
         if absent or child.crashes >= budget:
             self._show_output(child)
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
         self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")
         self._show_output(child)
-        self._give_up(child, reason, child.crashes + 1)
+        child.crashes += 1
+        self._give_up(child, reason)
         return None
 
-    def _budget(self, stage: str) -> int:
-        """How often a process may crash. What a stage remembers is rebuilt from recorded messages, if there are any."""
-        forgets = self._run.steps_only and self._run.remembers(stage)
-        return 0 if forgets else self._graph.nodes[stage].restarts
-
-    def _give_up(self, child: Child, reason: str, crashes: int) -> None:
+    def _give_up(self, child: Child, reason: str) -> None:
         """Tells everybody that a process is dead and will be replaced."""
-        child.successor, child.dies_at = (reason, crashes), time.monotonic()
+        child.replaced_because, child.dies_at = reason, time.monotonic()
         self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
         if left := self._launch.end_rest(child.process):
-            self._say(f"{self._name(child.process)} {behind(left)}", "warning")
+            self._say(f"{self._run.name_of(child.process)} {behind(left)}", "warning")
 
-    def _start_successor(self, child: Child, reason: str, crashes: int) -> None:
+    def _start_successor(self, child: Child) -> None:
         """Puts a new process in the place of one that has gone, once the recorder has all that it has sent."""
         process = child.process
-        if process not in self._settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
+        if process not in self.settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
             return
         successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
-        successor.restarted_because, successor.crashes = reason, crashes
+        successor.restarted_because, successor.crashes = child.replaced_because, child.crashes
         self._children[process.stage, process.replica] = successor
 
     def _show_output(self, child: Child) -> None:
         for line in last_lines(child.log, SHOWN_LINES, child.log_from):
-            self._terminal.show(self._name(child.process), f"| {line}", "error")
-
-    def _name(self, process: Process) -> str:
-        return self._run.name_of(process.stage, process.replica)
-
-
-def _shared(graph: Graph, stage: str) -> frozenset[tuple[str, str, str]]:
-    return frozenset((route.output, route.consumer, route.input) for route in graph.routes(stage) if route.shared)
+            self._terminal.show(self._run.name_of(child.process), f"| {line}", "error")

@@ -8,7 +8,7 @@ import msgspec
 from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, node_entry
 from runner.graph.placement import Network
 from runner.hosts.head import Hosts
-from runner.message.packet import RECORDER, Process
+from runner.message.packet import Process
 from runner.process.children import Family, spawn
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
@@ -41,14 +41,14 @@ class Run:
         """The run's folder, beside its recording."""
         return self.recording.with_suffix("")
 
-    def log_of(self, stage: str, replica: int) -> Path:
+    def log_of(self, process: Process) -> Path:
         """Where a process and its successors print."""
-        return self.directory / "log" / f"{stage}-{replica}.txt"
+        return self.directory / "log" / f"{process.stage}-{process.replica}.txt"
 
-    def name_of(self, stage: str, replica: int) -> str:
+    def name_of(self, process: Process) -> str:
         """A process as people know it: with the replica's number where there are several."""
-        node = self.graph.nodes.get(stage)
-        return f"{stage}.{replica}" if node is not None and node.replicated else stage
+        node = self.graph.nodes.get(process.stage)
+        return f"{process.stage}.{process.replica}" if node is not None and node.replicated else process.stage
 
     def remembers(self, stage: str) -> bool:
         """Whether a successor must learn from the recording what its predecessor knew."""
@@ -66,7 +66,7 @@ class Launcher:
         self._forks = forks
         self._family = Family()
 
-    def recorder(self) -> Child:
+    def recorder(self, process: Process) -> Child:
         """Starts what writes the recording."""
         run = self._run
         topics = {
@@ -87,7 +87,9 @@ class Launcher:
             destinations=run.graph.destinations(),
             processes=tuple(run.graph.processes()),
         )
-        return self._spawn(Process(RECORDER, 0), "runner.process.recorder", msgspec.json.encode(task))
+        log = run.log_of(process)
+        handle = self._forks.start("runner.process.recorder", process.stage, task=msgspec.json.encode(task), log=log)
+        return Child(process, handle, log)
 
     def viewer(self) -> Child:
         """Starts the viewer on the recording as it grows."""
@@ -99,16 +101,17 @@ class Launcher:
 
     def stage(self, process: Process, progress: Progress) -> Child:
         """Starts a process of the graph; ``progress`` is how far its stage has come before."""
-        task, limits = self._assignment(process, progress), self._run.graph.nodes[process.stage].limits
-        host = self._run.graph.host_of(process.stage, process.replica)
+        run, task = self._run, self._assignment(process, progress)
+        log = run.log_of(process)
+        log_from = log.stat().st_size if log.exists() else 0
+        host = run.graph.host_of(process.stage, process.replica)
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
-            log = self._run.log_of(process.stage, process.replica)
-            child = Child(process, self._hosts.start(host, process, task, log), log)
+            handle = self._hosts.start(host, process, task, log)
         else:
-            mark = self._family.mark(process.path)
-            child = self._spawn(process, "runner.process.stage_process", msgspec.json.encode(task), mark)
-        child.watch = Watch(limits)
-        return child
+            module, mark = "runner.process.stage_process", self._family.mark(process.path)
+            data = msgspec.json.encode(task)
+            handle = self._forks.start(module, run.name_of(process), task=data, log=log, mark=mark)
+        return Child(process, handle, log, log_from=log_from, watch=Watch(run.graph.nodes[process.stage].limits))
 
     def _assignment(self, process: Process, progress: Progress) -> Assignment:
         run = self._run
@@ -141,10 +144,3 @@ class Launcher:
         """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
         self._forks.close()
         return self._family.close()
-
-    def _spawn(self, process: Process, module: str, task: bytes, mark: str = "") -> Child:
-        log = self._run.log_of(process.stage, process.replica)
-        log_from = log.stat().st_size if log.exists() else 0
-        name = self._run.name_of(process.stage, process.replica)
-        handle = self._forks.start(module, name, task=task, log=log, mark=mark)
-        return Child(process, handle, log, log_from=log_from)

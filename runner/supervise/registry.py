@@ -6,7 +6,6 @@ import contextlib
 import os
 from collections.abc import Generator
 from pathlib import Path
-from typing import IO
 
 import msgspec
 
@@ -34,11 +33,11 @@ class Entry(msgspec.Struct, frozen=True):
 class Registration:
     """Lists a run until it is closed, or its process dies."""
 
-    def __init__(self, entry: Entry, folder: Path | None = None) -> None:
+    def __init__(self, entry: Entry) -> None:
         """Raises Refused where the folder cannot be made or is not this user's alone."""
-        self._path = (folder or runtime_folder()) / f"{entry.run}.json"
+        self._path = runtime_folder() / f"{entry.run}.json"
         unlisted = self._path.with_suffix(f".{os.getpid()}")
-        self._file: IO[bytes] = unlisted.open("wb")
+        self._file = unlisted.open("wb")
         hold(self._file)
         self._file.write(msgspec.json.format(msgspec.json.encode(entry)))
         self._file.flush()
@@ -64,15 +63,15 @@ def naming() -> Generator[None]:
         yield
 
 
-def runs(folder: Path | None = None) -> list[Entry]:
+def runs() -> list[Entry]:
     """Every run that lives, oldest first; what dead ones have left is cleaned up."""
-    found = [_read(path) for path in sorted((folder or runtime_folder()).iterdir())]
-    return sorted((entry for entry in found if entry is not None), key=lambda entry: entry.started)
+    found = filter(None, map(_read, runtime_folder().glob("*.json")))
+    return sorted(found, key=lambda entry: (entry.started, entry.run))
 
 
-def find_run(name: str | None = None, folder: Path | None = None) -> Entry:
+def find_run(name: str | None = None) -> Entry:
     """The run of that name (or the only one whose name begins so), or the only run there is."""
-    living = runs(folder)
+    living = runs()
     exact = [entry for entry in living if entry.run == name]
     fitting = exact or [entry for entry in living if name is None or entry.run.startswith(name)]
     if len(fitting) == 1:
@@ -85,15 +84,13 @@ def find_run(name: str | None = None, folder: Path | None = None) -> Entry:
     raise Refused(f"{len(fitting)} graphs are running: choose one with --run; valid: {listed}")
 
 
-def is_alive(entry: Entry, folder: Path | None = None) -> bool:
+def is_alive(entry: Entry) -> bool:
     """Whether a run is still listed by a supervisor that lives."""
-    return any(other.run == entry.run for other in runs(folder))
+    return any(other.run == entry.run for other in runs())
 
 
 def _read(path: Path) -> Entry | None:
     """One entry, or None where its supervisor has died; its file is removed then."""
-    if path.suffix != ".json":
-        return None
     try:
         with path.open("rb") as file:
             entry, lives = msgspec.json.decode(file.read(), type=Entry), is_being_written(file)

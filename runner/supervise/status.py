@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict, deque
+from typing import Any
 
 import msgspec
 
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.message.codec import Pulse
+from runner.message.packet import Process
 
 SILENT_NS = 3_000_000_000
 WINDOW = 7
@@ -72,49 +74,46 @@ class RunStatus(msgspec.Struct, frozen=True):
     """Messages of the supervisor's own, by topic."""
 
 
-class Rates:
-    """The pulses of the last seconds, from which rates are taken."""
+class Pulses:
+    """The newest pulses of every process, from which its rates are taken."""
 
     def __init__(self) -> None:
-        self._pulses: dict[tuple[str, int], deque[tuple[int, Pulse]]] = defaultdict(lambda: deque(maxlen=WINDOW))
+        self._pulses = defaultdict[Process, deque[tuple[int, Pulse]]](lambda: deque(maxlen=WINDOW))
 
     def note(self, pulse: Pulse, arrived_ns: int) -> None:
-        """Takes a pulse; those of an earlier incarnation count no more."""
-        window = self._pulses[pulse.stage, pulse.replica]
-        if window and window[-1][1].pid != pulse.pid:
-            window.clear()
-        window.append((arrived_ns, pulse))
+        """Takes a pulse as it comes."""
+        process = Process(pulse.stage, pulse.replica, pulse.incarnation)
+        self._pulses[process].append((arrived_ns, pulse))
 
-    def state(self, stage: str, replica: int) -> str:
-        """What the newest pulse says, or ``silent`` where none has come for a while."""
-        arrived_ns, newest = self._ends(stage, replica)[1]
+    def newest(self, process: Process) -> Pulse | None:
+        """The newest of a process, if any has come."""
+        window = self._pulses.get(process)
+        return window[-1][1] if window else None
+
+    def state(self, process: Process) -> str:
+        """What the newest pulse of a process says, ``silent`` where it is old, ``starting`` where there is none."""
+        window = self._pulses.get(process)
+        if not window:
+            return "starting"
+        arrived_ns, newest = window[-1]
         return newest.state if time.monotonic_ns() - arrived_ns < SILENT_NS else "silent"
 
-    def cpu(self, stage: str, replica: int) -> float:
-        """Processor time per time of one process."""
-        (began, first), (ended, last) = self._ends(stage, replica)
-        return (last.cpu_ns - first.cpu_ns) / (ended - began)
+    def rates(self, process: Process) -> dict[str, Any]:
+        """What of a :class:`ProcessStatus` is a rate."""
+        window = list(self._pulses.get(process, ()))
+        if not window:
+            return {}
+        (began, first), (ended, last) = window[0], window[-1]
+        seconds = max(ended - began, 1) * 1e-9
+        return {
+            "cpu": (last.cpu_ns - first.cpu_ns) * 1e-9 / seconds,
+            "steps_per_second": (last.steps - first.steps) / seconds,
+            "sent": {port: _flow(first.sent.get(port, (0, 0)), sent, seconds) for port, sent in last.sent.items()},
+        }
 
-    def steps(self, stage: str, replica: int) -> float:
-        """Steps per second of one process."""
-        (began, first), (ended, last) = self._ends(stage, replica)
-        return (last.steps - first.steps) / (ended - began) * 1e9
 
-    def sent(self, stage: str, replica: int) -> dict[str, Flow]:
-        """What one process sends, by output port."""
-        (began, first), (ended, last) = self._ends(stage, replica)
-        seconds = (ended - began) * 1e-9
-        flows: dict[str, Flow] = {}
-        for port, (messages, size) in last.sent.items():
-            before, size_before = first.sent.get(port, (0, 0))
-            flows[port] = Flow(messages, (messages - before) / seconds, (size - size_before) / seconds)
-        return flows
-
-    def _ends(self, stage: str, replica: int) -> tuple[tuple[int, Pulse], tuple[int, Pulse]]:
-        window = list(self._pulses[stage, replica])
-        nothing = Pulse(stage, replica, 0, 0, "")
-        (began, first), (ended, last) = (window[0], window[-1]) if window else ((0, nothing), (0, nothing))
-        return (began, first), (max(ended, began + 1), last)
+def _flow(before: tuple[int, int], now: tuple[int, int], seconds: float) -> Flow:
+    return Flow(now[0], (now[0] - before[0]) / seconds, (now[1] - before[1]) / seconds)
 
 
 def topics_of(graph: Graph) -> tuple[TopicStatus, ...]:

@@ -5,16 +5,19 @@ import itertools
 import os
 import queue
 import signal
+import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
 from runner.contract import Finished, Level, Message, Refused, Restarted
-from runner.graph.graph import FINISHED, SUPERVISOR, Graph
+from runner.graph.graph import FINISHED, SUPERVISOR, Graph, Route
 from runner.graph.placement import ALONE
 from runner.graph.ports import port_name
 from runner.hosts.head import Hosts
@@ -24,7 +27,7 @@ from runner.message import codec
 from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.delivery import Delivery
+from runner.process.delivery import Delivery, Stopped
 from runner.process.fork_server import ForkServer
 from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
@@ -36,6 +39,7 @@ from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import Gateway, new_endpoint, remove_sockets
 
+R = TypeVar("R", bound=msgspec.Struct)
 EXIT_INCOMPLETE = 3
 
 
@@ -81,24 +85,26 @@ class Supervisor:
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
         self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
-        self._delivery = Delivery(
-            SUPERVISOR, graph.routes(SUPERVISOR), self._bus.publish, self._warn, stopping=self._stopping.is_set
-        )
+        warn = partial(self._say, level="warning")
+        stopping = self._stopping.is_set
+        self._delivery = Delivery(SUPERVISOR, _own_routes(graph), self._bus.publish, warn, stopping=stopping)
         self._events: queue.SimpleQueue[End] = queue.SimpleQueue()
         self._times, self._skipped = StageTimes(), Skipped(graph)
-        self._refusals = Refusals(self._complain)
+        self._refusals = Refusals(partial(self._say, level="error"))
         self._guardian = Guardian(
             run,
             self._hosts,
             terminal,
             forks,
             say=self._say,
-            announce=self._publish_restart,
+            announce=partial(self._publish, port_name(Restarted)),
             declare_lost=self._declare_lost,
         )
         self._numbers: dict[str, int] = defaultdict(int)
         """Next sequence number by output port of the supervisor."""
-        self._numbering = threading.Lock()
+        self._numbering = threading.Condition()
+        self._publishing = 0
+        """Messages of the supervisor's own that have a number and no step yet."""
         self._own_steps = 0
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
@@ -118,7 +124,10 @@ class Supervisor:
             end = self._watch()
         finally:
             verdict = self._stop()
-        return self._dismiss(self._conclude(end, verdict))
+        end = self._conclude(end, verdict)
+        if self._hosts is not None:
+            self._hosts.close(end.code, end.reason)
+        return end
 
     def _watch(self) -> End:
         """Waits for the end, and has looked after the processes meanwhile."""
@@ -127,29 +136,33 @@ class Supervisor:
                 end = self._events.get(timeout=TICK_SECONDS)
                 self._guardian.name_the_dead()
                 return end
-            end = self._guardian.look()
-            if end is not None:
+            if (end := self._guardian.look()) is not None:
                 return end
 
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _connect(self) -> None:
-        subscribe = self._bus.subscribe
-        subscribe("j/*", self._on_journal)
-        subscribe("l/*", self._on_log)
-        subscribe(f"m/*/{FINISHED}", self._on_finished)
-        subscribe("settled/**", lambda packet: self._on_word(packet, self._guardian.note_settled))
-        subscribe("e/**", lambda packet: self._on_word(packet, self._guardian.note_quiet))
-        subscribe("h/**", self._on_pulse)
+        self._hear("j/*", Journal, self._on_journal)
+        self._hear("l/*", LogLine, self._on_log)
+        self._hear("h/**", Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns))
+        self._hear(f"m/*/{FINISHED}", Envelope, self._on_finished)
         for key in self._calls.answer_keys:
-            subscribe(f"m/{key}", self._on_answer)
+            self._hear(f"m/{key}", Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
+        self._bus.subscribe("settled/**", partial(self._on_word, self._guardian.settled))
+        self._bus.subscribe("e/**", partial(self._on_word, self._guardian.quiet))
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
 
-    def _on_journal(self, packet: Packet) -> None:
-        journal = self._refusals.read(Journal, packet)
-        if journal is None:
-            return
+    def _hear(self, path: str, kind: type[R], note: Callable[[R, Packet], None]) -> None:
+        """Has everything noted that is sent to a path; what is not of its kind is refused."""
+
+        def take(packet: Packet) -> None:
+            if (record := self._refusals.read(kind, packet)) is not None:
+                note(record, packet)
+
+        self._bus.subscribe(path, take)
+
+    def _on_journal(self, journal: Journal, packet: Packet) -> None:
         self._delivery.answered(packet.end, journal.answered)
         for step in journal.steps:
             self._delivery.answered(step.stage, answered(step))
@@ -161,37 +174,25 @@ class Supervisor:
             elif step.outcome == "ended":
                 self._has_ended.set()
 
-    def _on_answer(self, packet: Packet) -> None:
-        envelope = self._refusals.read(Envelope, packet)
-        if envelope is not None:
-            self._calls.note_answer(envelope.id, packet.payload)
+    def _on_log(self, line: LogLine, _: Packet) -> None:
+        self._calls.note_log(line)
+        if line.stage != SUPERVISOR and line.level != "debug":
+            self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
 
-    def _on_log(self, packet: Packet) -> None:
-        line = self._refusals.read(LogLine, packet)
-        if line is not None:
-            self._calls.note_log(line)
-            if line.stage != SUPERVISOR and line.level != "debug":
-                self._terminal.show(self._run.name_of(line.stage, line.replica), line.text, line.level)
-
-    def _on_finished(self, packet: Packet) -> None:
+    def _on_finished(self, envelope: Envelope, packet: Packet) -> None:
         try:
-            finished = codec.open_envelope(Finished, codec.unpack(Envelope, packet.payload))
+            finished = codec.open_envelope(Finished, envelope)
         except CodecError as error:
             self._refusals.refuse(packet.key, error)
         else:
             self._events.put(End(finished.code, finished.reason))
 
-    def _on_word(self, packet: Packet, note: Callable[[Process], None]) -> None:
+    def _on_word(self, named: set[Process], packet: Packet) -> None:
         """What is said of the process that a key names."""
         try:
-            note(Process.of(packet.key))
+            named.add(Process.of(packet.key))
         except Refused as refusal:
             self._refusals.refuse(packet.key, refusal)
-
-    def _on_pulse(self, packet: Packet) -> None:
-        pulse = self._refusals.read(Pulse, packet)
-        if pulse is not None:
-            self._guardian.note_pulse(pulse, packet.arrived_ns)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
@@ -202,20 +203,25 @@ class Supervisor:
 
     # ------------------------------------------------------------------------------------------ what is published
 
-    def _publish_restart(self, restarted: Restarted) -> None:
-        self._publish(port_name(Restarted), restarted)
-
-    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> None:
-        """Sends a message of the supervisor's own; ``say`` is told its id before anybody else."""
+    def _publish(self, port: str, message: Message, say: Callable[[str], object] = lambda _: None) -> str:
+        """Sends a message of the supervisor's own and returns its id; ``say`` is told that before anybody else."""
         with self._numbering:
+            if self._stopping.is_set():
+                raise Refused("the graph ends")
             own = f"{SUPERVISOR}.{port}#{self._numbers[port]}"
+            envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
             self._numbers[port] += 1
+            self._publishing += 1
         say(own)
-        envelope = codec.envelope(message, id=own, lineage=own, time_ns=time.time_ns(), causes=())
         try:
-            self._delivery.publish(port, envelope, codec.pack(envelope))
+            with contextlib.suppress(Stopped):  # nobody does it, but it has been sent, and is left by who should have
+                self._delivery.publish(port, envelope, codec.pack(envelope))
         finally:
             self._journal((own,))
+            with self._numbering:
+                self._publishing -= 1
+                self._numbering.notify_all()
+        return own
 
     def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
         with self._numbering:
@@ -233,7 +239,9 @@ class Supervisor:
 
     def _stop(self) -> str:
         """Ends all processes and what connects them, and returns the recorder's verdict."""
-        self._stopping.set()
+        with self._numbering:
+            self._stopping.set()
+            self._numbering.wait_for(lambda: not self._publishing, RECORDED_SECONDS)
         self._calls.close()
         self._bus.publish(f"e/{self._own.path}", b"")
         self._guardian.end()
@@ -251,12 +259,6 @@ class Supervisor:
             self._terminal.plain("", *times, *self._skipped.lines(), "")
         self._terminal.plain(f"recording {verdict}")
         return end if self._guardian.complete or end.code else End(EXIT_INCOMPLETE, "the recording is INCOMPLETE")
-
-    def _dismiss(self, end: End) -> End:
-        """Tells the other hosts how it ended."""
-        if self._hosts is not None:
-            self._hosts.close(end.code, end.reason)
-        return end
 
     # ------------------------------------------------------------------------------------------ what is asked
 
@@ -302,11 +304,12 @@ class Supervisor:
         line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
         self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
 
-    def _complain(self, text: str) -> None:
-        self._say(text, "error")
 
-    def _warn(self, text: str) -> None:
-        self._say(text, "warning")
+def _own_routes(graph: Graph) -> Iterator[Route]:
+    """What the supervisor publishes: who replaces the dead must not wait until one of them has room."""
+    for route in graph.routes(SUPERVISOR):
+        waits = route.output in graph.commands()
+        yield route if waits else msgspec.structs.replace(route, queue=sys.maxsize)
 
 
 def _new_recording(folder: Path, name: str) -> tuple[str, Path]:

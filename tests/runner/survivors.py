@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from runner.contract import Context, Finished, Message, Refused, Spec, Stage
+from runner.contract import Context, Finished, Message, Refused, Restarted, Spec, Stage
 from tests.runner.toys import Answer, Double, Number, Piece
 
 
@@ -86,6 +86,14 @@ class Quitter(Stage):
         if number.value == 2 and first_time(ctx.directory / "left"):
             raise SystemExit(2) if self._config.way == "quit" else KeyboardInterrupt(2)
         return Double(value=2 * number.value)
+
+
+class Mourner(Stage):
+    """Dies of the first death that it hears of."""
+
+    def on_restarted(self, restarted: Restarted, ctx: Context) -> None:
+        if first_time(ctx.directory / "heard"):
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 class FragileSplitter(Stage):

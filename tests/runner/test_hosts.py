@@ -211,6 +211,19 @@ def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_
 
 
 @pytest.mark.slow
+def test_a_process_elsewhere_is_explained_by_what_it_said_itself(parties, tmp_path: Path):
+    graph = tmp_path / "graph.yaml"
+    text = HOSTS.read_text().replace("toys:Worker", "survivors:Troubled")
+    graph.write_text(text.replace("{worker1: 1, worker2: 1}", "worker1"))
+    party = parties(on_loopback(), tmp_path, graph=graph)
+    party.start_all(f"worker.marks={tmp_path}", "worker.crash_at=0", "worker.exit_at=1")
+    head = party.end("head")
+    assert "worker restarts (1 of 3): killed by SIGSEGV" in head.output, head.output
+    assert "worker restarts (2 of 3): ended with exit code 3" in head.output, head.output
+    assert head.output.count("| Fatal Python error") == 1
+
+
+@pytest.mark.slow
 def test_hosts_meet_at_a_router_that_is_none_of_them(here: Run, parties, tmp_path: Path):
     graph, endpoint = tmp_path / "graph.yaml", free_address()
     graph.write_text(f"router: {endpoint}\n{HOSTS.read_text()}")

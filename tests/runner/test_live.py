@@ -10,7 +10,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
@@ -21,7 +22,7 @@ import pytest
 from runner.cli.completion import Shell, script
 from runner.cli.doctor import examine, examine_graph
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.graph import QUEUE, load_graph
 from runner.inspect.echo import lines_of
 from runner.live.live import Live
 from runner.live.tables import show_progress
@@ -257,18 +258,43 @@ def test_a_command_reaches_the_process_that_follows_a_dead_one(account: Run) -> 
         assert call(live, "add", amount="5").lines == (("info", "5 added"),)
 
 
-def test_a_call_is_done_when_every_replica_has_done_it() -> None:
+def test_a_call_that_waits_for_room_when_the_graph_ends_spoils_no_recording(tmp_path: Path) -> None:
+    run = Run(tmp_path, ACCOUNT, "counter.count=0")
+    one = CallRequest("account", "add", {"amount": "1"})
+    with Live(run.entry) as live, ThreadPoolExecutor() as pool:
+        os.kill(run.pid_of("account"), signal.SIGSTOP)
+        for _ in range(QUEUE):
+            live.call(one)
+        waiting = pool.submit(live.call, one)
+        wait_until(lambda: live.status().published["supervisor/account_add"] == QUEUE + 1)
+        live.down()
+        assert waiting.result() == f"supervisor.account_add#{QUEUE}"
+        with pytest.raises(Refused, match="the graph ends"):
+            live.call(one)
+    finished = run.finish()
+    assert str(Recording(finished.recording).verdict) == "COMPLETE", finished.output
+
+
+def test_a_call_is_done_when_every_replica_has_done_it_even_if_one_failed_before() -> None:
     graph = load_graph(ACCOUNT)
     graph.nodes["account"] = dataclasses.replace(graph.nodes["account"], replicas=2)
-    calls = Calls(graph, lambda port, _, say: say(f"supervisor.{port}#0"))
+
+    def publish(port: str, _: object, say: Callable[[str], None]) -> str:
+        id = f"supervisor.{port}#0"
+        say(id)
+        return id
+
+    calls = Calls(graph, publish)
     id = calls.call(CallRequest("account", "add", {"amount": "1"}))
     step = Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0)
+    calls.note_step(msgspec.structs.replace(step, emitted=(), outcome="failed", error="gone"))
     calls.note_step(step)
     calls.note_log(LogLine("account", 0, "info", "half done", 1))
     assert not calls.progress(CallQuestion(id, 0)).done
     calls.note_step(msgspec.structs.replace(step, replica=1))
     done = calls.progress(CallQuestion(id, 0))
-    assert (done.done, done.emitted, done.lines) == (True, ("account.sum#0",), (("info", "half done"),))
+    assert (done.done, done.refused, done.emitted) == (True, "", ("account.sum#0",))
+    assert done.lines == (("error", "gone"), ("info", "half done"))
 
 
 def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixture[str]) -> None:

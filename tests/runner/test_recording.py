@@ -398,7 +398,7 @@ def test_damage_among_the_missing_of_the_verdict_hides_nothing(tmp_path: Path, d
     path = tmp_path / "gap.mcap"
     recorder = writer(path)
     for sequence in (0, 2):
-        recorder.put(Envelope, pack(number(sequence)))
+        put(recorder, number(sequence))
     recorder.close()
     content = path.read_bytes()
     path.write_bytes(content.replace(b'["counter.number#1"]', damage.ljust(20)))

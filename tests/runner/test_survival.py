@@ -15,6 +15,7 @@ import pytest
 
 from runner.message.ids import MessageId
 from runner.process.children import DESCENT, Family
+from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
 from tests.runner.machines import Party, on_loopback
 from tests.runner.survivors import lives, living
@@ -101,6 +102,36 @@ def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
     assert re.search(r"worker restarts \(1 of 3\): ended with exit code 3", silent.output)
 
 
+SEEN_FIRST = """
+import sys, threading
+from runner.cli.main import main
+from runner.message.packet import GATEWAY
+from runner.process.fork_server import ForkServer
+from runner.supervise.guardian import Guardian
+start, note, seen = ForkServer.start, Guardian.note_presence, threading.Semaphore(0)
+def start_late(*arguments, **more):
+    handle = start(*arguments, **more)
+    seen.acquire()
+    return handle
+def note_early(self, process, present):
+    note(self, process, present)
+    if process.stage != GATEWAY:
+        seen.release()
+ForkServer.start, Guardian.note_presence = start_late, note_early
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_process_may_be_there_before_who_started_it_goes_on(tmp_path: Path):
+    command = [sys.executable, "-c", SEEN_FIRST, "up", str(DOUBLES), "--recordings", str(tmp_path)]
+    command += ["--set", f"sink.path={tmp_path / 'out.txt'}", "--set", "doubler.die_at=2"]
+    done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    ready = re.findall(r"(\w+) +ready after", done.stdout)
+    assert sorted(ready) == ["counter", "doubler", "doubler", "sink"], done.stdout
+    assert "all 3 processes are ready" in done.stdout
+
+
 def test_without_its_recorder_a_graph_ends(tmp_path: Path):
     process = start(DOUBLES, tmp_path, *ENDLESS)
     before = read_until(process, "processes are ready")
@@ -137,6 +168,23 @@ def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     assert all(body == bodies(undisturbed)[id] for id, body in bodies(disturbed).items() if "double" in id)
     code, said = verify(disturbed.recording)
     assert code == 0, said
+
+
+MOURNER = """
+  mourner:
+    stage: tests.runner.survivors:Mourner
+    inputs: {restarted: {from: supervisor.restarted, queue: 1}}
+"""
+
+
+def test_who_replaces_the_dead_waits_for_none_of_them(tmp_path: Path):
+    graph = tmp_path / "graph.yaml"
+    graph.write_text(DOUBLES.read_text() + MOURNER)
+    settings = ("counter.count=60", "counter.period=0.05", "sink.count=60", "doubler.die_at=2")
+    ended = run(graph, tmp_path, *settings)
+    assert (ended.code, len(ended.result)) == (0, 60), ended.output
+    assert re.findall(r"(\w+) restarts \(1 of 3\): killed by SIGKILL", ended.output) == ["doubler", "mourner"]
+    assert Recording(ended.recording).verdict.complete
 
 
 @pytest.mark.parametrize("way", ["quit", "interrupt"])
