@@ -105,17 +105,18 @@ def test_an_exit_without_a_word_is_an_error(tmp_path: Path):
 SEEN_FIRST = """
 import sys, threading
 from runner.cli.main import main
-from runner.message.packet import GATEWAY
+from runner.message.packet import GATEWAY, RECORDER
 from runner.process.fork_server import ForkServer
 from runner.supervise.guardian import Guardian
 start, note, seen = ForkServer.start, Guardian.note_presence, threading.Semaphore(0)
-def start_late(*arguments, **more):
-    handle = start(*arguments, **more)
-    seen.acquire()
+def start_late(self, module, name, **more):
+    handle = start(self, module, name, **more)
+    if name != RECORDER:  # which is there once all others are
+        seen.acquire()
     return handle
 def note_early(self, process, present):
     note(self, process, present)
-    if process.stage != GATEWAY:
+    if process.stage not in (GATEWAY, RECORDER):
         seen.release()
 ForkServer.start, Guardian.note_presence = start_late, note_early
 sys.exit(main(sys.argv[1:]))
