@@ -49,7 +49,7 @@ class Document:
             raise Refused(f"--set {assignment}: expected key=value, for example --set camera.dataset=DIR")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError):
             value = text
         keys = self._keys_of(key)
         _nested(self.values, keys[:-1])[keys[-1]] = value
@@ -71,9 +71,13 @@ class Document:
 
 def read_document(path: Path) -> Document:
     """Reads a YAML graph file; raises Refused with file and line where it is not a mapping of unique keys."""
+    document = Document(str(path), path.parent.absolute(), {})
     try:
         loader = yaml.SafeLoader(path.read_text())
         root = loader.get_single_node()
+        if not isinstance(root, yaml.MappingNode):
+            raise Refused(f"{path}:1: expected a mapping with name and stages")
+        document.values = _read_node(loader, root, document, ())
     except OSError as error:
         raise Refused(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -82,10 +86,8 @@ def read_document(path: Path) -> Document:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         raise Refused(f"{path}{line}: not YAML: {getattr(error, 'problem', None) or error}") from None
-    if not isinstance(root, yaml.MappingNode):
-        raise Refused(f"{path}:1: expected a mapping with name and stages")
-    document = Document(str(path), path.parent.absolute(), {})
-    document.values = _read_node(loader, root, document, ())
+    except RecursionError:
+        raise Refused(f"{path}: not YAML: a mapping contains itself") from None
     return document
 
 
@@ -100,7 +102,10 @@ def suggest(wrong: str, valid: Iterable[str]) -> str:
 def _read_node(loader: yaml.SafeLoader, node: yaml.Node, document: Document, keys: Keys) -> Any:
     document.lines.setdefault(keys, node.start_mark.line + 1)
     if not isinstance(node, yaml.MappingNode):
-        return loader.construct_object(node, deep=True)
+        try:
+            return loader.construct_object(node, deep=True)
+        except ValueError as error:  # a date or number that is none
+            raise Refused(f"{document.place(*keys)}: {error}") from None
     values: dict[str, Any] = {}
     for key_node, value_node in node.value:
         key = str(loader.construct_object(key_node))

@@ -27,6 +27,8 @@ ROUTER = "router"
 READER = "reader"
 """Common name of who may listen at a run's public address, and do nothing else."""
 RESERVED = (ROUTER, READER, "ca")
+NAME, CHARACTERS = re.compile(r"[a-z][a-z0-9_-]*"), "lower case letters, digits, _ and -"
+"""Of hosts: their keys lie in folders of these names."""
 
 
 class Credentials(msgspec.Struct, frozen=True):
@@ -166,8 +168,8 @@ def read_owners(what: Sequence[str]) -> tuple[Layout, Path]:
         return layout, layout.keys or document.folder / "keys"
     pairs = [text.partition("=") for text in what]
     for name, equals, address in pairs:
-        if not (name and equals and address):
-            raise Refused(f"{name}: expected one graph file, or hosts as NAME=ADDRESS")
+        if not (re.fullmatch(NAME, name) and equals and address):
+            raise Refused(f"{name}: expected one graph file, or hosts as NAME=ADDRESS, names of {CHARACTERS}")
     hosts = tuple(read_endpoint(address, f"{name}={address}", name=name) for name, _, address in pairs)
     return Layout(hosts), Path("keys")
 
@@ -197,9 +199,8 @@ def _entries(document: Document) -> Mapping[str, Any]:
 
 def _read_host(document: Document, name: str, value: object) -> Host:
     place = document.place("hosts", name)
-    if not re.fullmatch(r"[a-z][a-z0-9_-]*", name) or name in RESERVED:
-        words = ", ".join(RESERVED)
-        raise Refused(f"{place}: a host's name is lower case letters, digits, _ and -, and none of {words}")
+    if not re.fullmatch(NAME, name) or name in RESERVED:
+        raise Refused(f"{place}: a host's name is {CHARACTERS}, and none of {', '.join(RESERVED)}")
     if not isinstance(value, str):
         raise Refused(f"{place}: expected ADDRESS or ADDRESS:PORT, got {value!r}")
     return read_endpoint(value, place, name=name)

@@ -166,7 +166,10 @@ def _hash(paths: Sequence[Path]) -> str:
     size = sum(path.stat().st_size for path in paths)
     if size > HASHED_BYTES:
         return f"not hashed, {size} bytes"
-    first, *others = (hashlib.sha256(path.read_bytes()) for path in paths)
+    try:
+        first, *others = [hashlib.sha256(path.read_bytes()) for path in paths]
+    except OSError as error:
+        return f"not hashed, {error.strerror}"
     if not others:
         return first.hexdigest()
     return hashlib.sha256(b"".join(found.digest() for found in (first, *others))).hexdigest()

@@ -18,7 +18,7 @@ from typing import cast
 import msgspec
 
 from runner.contract import Refused
-from runner.graph.graph import Graph, Node
+from runner.graph.graph import Edge, Graph, Node
 from runner.message.codec import CodecError, Envelope
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
@@ -150,7 +150,7 @@ class PartialReplay:
     # ------------------------------------------------------------------------------------ processes
 
     def _start(self, node: Node, folder: Path) -> _Stage:
-        node = replace(node, inputs={port: replace(edge, policy="block") for port, edge in node.inputs.items()})
+        node = replace(node, inputs={port: Edge(edge.source, queue=edge.queue) for port, edge in node.inputs.items()})
         files = folder / node.name
         files.mkdir()
         node.prepare()

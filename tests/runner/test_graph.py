@@ -41,6 +41,9 @@ def test_a_good_graph_loads(tmp_path: Path):
         ("replicas: 2", "replica: 2", ":11: stages.worker.replica: unknown key 'replica'; did you mean 'replicas'"),
         ("seed: 7", "sed: 7", ":2: sed: unknown key 'sed'; did you mean 'seed'"),
         ("seed: 7", "seed: [", ":4: not YAML"),
+        ("seed: 7", "seed: 2026-13-45", ":2: seed: month must be in"),
+        ("seed: 7", "seed: !wheat 7", ":2: not YAML: .*!wheat"),
+        ("seed: 7", "seed: &self {seed: *self}", ": not YAML: a mapping contains itself"),
         ("seed: 7", "name: again", ":2: name: this key appears twice"),
         ("seed: 7", "seed: many", ":2: seed: Expected `int`, got `str`"),
         ("toys:Sink", "toys:Snk", ":19: stages.sink.stage: no class 'Snk' in .*; did you mean 'Sink'"),
@@ -147,6 +150,7 @@ def test_who_answers_no_parts_may_take_the_latest(tmp_path: Path):
         ("worker.seconds=soon", "--set worker.seconds: Expected `float`, got `str`"),
         ("splitter.replicas=2", "--set splitter.replicas: .* takes no Part"),
         ("seed", "--set seed: expected key=value"),
+        ("seed=2026-13-45", "--set seed: Expected `int`, got `str`"),
         ("splitter.parts=${worker.secnds}", "--set splitter.parts: no setting 'worker.secnds'"),
     ],
 )

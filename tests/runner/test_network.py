@@ -148,6 +148,8 @@ def test_owners_of_keys_come_from_a_graph_or_the_command_line(tmp_path: Path):
     )
     with pytest.raises(Refused, match="expected one graph file, or hosts as NAME=ADDRESS"):
         read_owners(["head=10.0.0.1", "arm"])
+    with pytest.raises(Refused, match=r"^\.\./arm: expected .* names of lower case letters, digits"):
+        read_owners(["../arm=10.0.0.1"])
 
 
 # ---------------------------------------------------------------------------------------------- between hosts

@@ -83,3 +83,9 @@ def test_a_recording_older_than_that_is_compared_by_the_packages_of_its_time(tmp
     packages = {**old.aspect("packages", dict[str, str]()), "torch": "0"}
     other = Recording(rewrite(OLD, tmp_path / "other.mcap", lambda _, data: data, {"packages": json.dumps(packages)}))
     assert other.fingerprint != old.fingerprint
+
+
+def test_a_file_that_cannot_be_read_is_named_with_the_reason():
+    """Readable for root, and yet it has nothing to read at its beginning."""
+    graph = {"stages": {"sink": {"config": {"path": "/proc/self/mem"}}}}
+    assert provenance.file_hashes(graph) == {"/proc/self/mem": "not hashed, Input/output error"}
