@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -43,10 +43,8 @@ REST_SECONDS = 0.005
 """What may come together before the recorder looks again."""
 UNSEEN_SECONDS = 0.5
 """How long it may take to see a process that has died at once."""
-SAY_REST_SECONDS = 0.002
-"""What may come together before it is said."""
-_Saying = Step | Callable[[], None] | None
-"""A step, what else is said in its turn, or the end."""
+_Saying = Step | Callable[[], None]
+"""A step, or what else is said in its turn."""
 
 
 class Recorder:
@@ -63,7 +61,9 @@ class Recorder:
         self._writer = RecordingWriter(manifest, self._complain)
         self._refusals = Refusals(self._complain)
         self._redelivery = Redelivery(manifest.destinations, self._say)
-        self._said: queue.SimpleQueue[_Saying] = queue.SimpleQueue()
+        self._to_say: deque[_Saying] = deque()
+        """Since the last look, for what comes together is said together."""
+        self._said: queue.SimpleQueue[list[_Saying] | None] = queue.SimpleQueue()
         self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
         self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
         self._ended = threading.Event()
@@ -160,6 +160,8 @@ class Recorder:
         for process in ready:
             self._catch_up(process)
         self._redelivery.offer_latest()
+        if said := [self._to_say.popleft() for _ in range(len(self._to_say))]:
+            self._said.put(said)
 
     def _has_all_of(self, process: Process) -> bool:
         """Whether a lost process has just come to where nothing more can come of it."""
@@ -202,7 +204,7 @@ class Recorder:
         elif self._lost.get(step.process) != 0:
             self._writer.put(step, packet.payload)
             self._redelivery.note_step(step)
-            self._said.put(step)
+            self._to_say.append(step)
 
     def _on_log(self, _: str, packet: Packet) -> None:
         line = self._refusals.read(LogLine, packet)
@@ -247,36 +249,23 @@ class Recorder:
     # ------------------------------------------------------------------------------------------ what is said
 
     def _say(self, key: str, payload: bytes, may_be_dropped: bool = False) -> None:
-        self._said.put(lambda: self._bus.publish(key, payload, may_be_dropped=may_be_dropped))
+        self._to_say.append(lambda: self._bus.publish(key, payload, may_be_dropped=may_be_dropped))
 
     def _say_all(self) -> None:
         """Tells the others what is here, on a thread of its own: a link that blocks must not stop the recording."""
-        while True:
-            first = self._said.get()
-            time.sleep(SAY_REST_SECONDS)
-            waiting = deque([first, *(self._said.get() for _ in range(self._said.qsize()))])
-            while waiting:
-                saying = waiting.popleft()
-                if saying is None:
-                    return
-                if isinstance(saying, Step):
-                    journal = Journal((saying, *_steps_after(saying, waiting)))
-                    self._bus.publish(f"j/{saying.stage}", pack(journal))
+        while (said := self._said.get()) is not None:
+            for stage, together in itertools.groupby(said, lambda one: one.stage if isinstance(one, Step) else ""):
+                if stage:
+                    self._bus.publish(f"j/{stage}", pack(Journal(tuple(cast("Iterator[Step]", together)))))
                 else:
-                    saying()
+                    for say in cast("Iterator[Callable[[], None]]", together):
+                        say()
 
     def _complain(self, text: str) -> None:
         """Shows and records a line."""
         line = LogLine(RECORDER, 0, "error", text, time.time_ns())
         self._bus.publish(f"l/{RECORDER}", pack(line))
         self._writer.put(line, pack(line))
-
-
-def _steps_after(first: Step, waiting: deque[_Saying]) -> Iterator[Step]:
-    """Those of the same stage that follow at once: they are said together."""
-    while waiting and isinstance(step := waiting[0], Step) and step.stage == first.stage:
-        waiting.popleft()
-        yield step
 
 
 def main() -> int:

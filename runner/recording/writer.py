@@ -43,7 +43,7 @@ from runner.recording.recording import (
 
 FLUSH_SECONDS = 0.25
 """A killed recorder loses no more than this."""
-CHUNK_BYTES = 4 * 2**20
+CHUNK_BYTES = 2**20
 REST_SECONDS = 0.02
 """What may come together before it is written."""
 BACKLOG_BYTES = 2**30

@@ -135,7 +135,7 @@ class Bus:
 
     def channel(self, path: str) -> Channel:
         """Everything sent to ``path`` by others, to be taken when the time has come: cheaper than calls one by one."""
-        return Channel(self._declare(self._session, path, FifoChannel(CHANNEL)), self._packet)
+        return Channel(self._declare(self._session, path, FifoChannel(CHANNEL)), len(self._run) + 1)
 
     def _declare(self, session: zenoh.Session, path: str, handler: Any) -> zenoh.Subscriber[Any]:
         origin = zenoh.Locality.REMOTE  # who publishes knows it already
@@ -228,16 +228,17 @@ class Bus:
 
 
 class Channel:
-    """What has been sent to one process and waits to be taken."""
+    """What has been sent to one process and waits to be taken; when it came is not known."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[Any], packet: Callable[[zenoh.Sample], Packet]):
+    def __init__(self, subscriber: zenoh.Subscriber[Any], prefix: int):
+        """``prefix`` is the length of what stands before the keys, the run."""
         self._subscriber = subscriber
-        self._packet = packet
+        self._prefix = prefix
 
     def take(self) -> Iterator[Packet]:
         """All that is there."""
         while (sample := self._subscriber.try_recv()) is not None:
-            yield self._packet(sample)
+            yield Packet(str(sample.key_expr)[self._prefix :], sample.payload.to_bytes(), 0, 0)
 
 
 def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:
