@@ -16,7 +16,7 @@ from stages.perception.poses import inverse
 from stages.perception.scoring import label_of
 from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.relations import Tolerances, assertions, supports
-from stages.scene.standing import Stances, Standing
+from stages.scene.standing import Stances, standing_of
 from stages.scene.virtual import satisfied
 
 _BELOW = 0.02
@@ -96,11 +96,7 @@ class Truth:
             for name, T in zip(snapshot.names, snapshot.T_base_objects, strict=True)
             if not _left(T, T_base_table)
         )
-        standing = [
-            Standing.at(item.name, self._stances[item.label], inverse(T_base_table) @ item.T_base_object)
-            for item in objects
-        ]
-        found = assertions(supports(standing, Tolerances()))
+        found = assertions(supports(standing_of(objects, self._stances, T_base_table), Tolerances()))
         return msgspec.structs.replace(taught, objects=objects, virtual_objects=(), assertions=found)
 
     def _wanted(self, shown: Snapshot, taught: SceneGraph) -> SceneGraph:
