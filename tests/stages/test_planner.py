@@ -303,7 +303,7 @@ def test_settings_are_checked():
 def test_whole_footprints_stay_on_the_table_with_a_margin(
     corner: tuple[float, float], left: float, turn: float, item: str, started: tuple[float, bool]
 ):
-    """Tables that end anywhere within reach, turned a little; goals beside what stands near an edge; things put aside."""
+    """Tables that end anywhere within reach, turned a little; goals beside what is near an edge; things put aside."""
     yaw, stacked = started
     surface = regions.moved(regions.rectangle(corner, (0.5, left)), yawed(turn, np.zeros(3)))
     goal = Layout().put("cereal_box", 0.05, 0.0).put(item, 0.05, 0.12)
