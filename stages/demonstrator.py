@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
+
+import msgspec
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import (
@@ -13,6 +15,7 @@ from stages.messages import (
     Assertion,
     Goal,
     LookRequest,
+    Observation,
     Outcome,
     Plan,
     Restore,
@@ -24,8 +27,10 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
+from stages.messages.scene import SceneObject
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
+from stages.scene.memory import Memory
 from stages.scene.virtual import satisfied
 
 
@@ -60,6 +65,11 @@ class State:
     goal: SceneGraph | None = None
     """What is to be restored; None while it is being shown."""
     scene: SceneGraph | None = None
+    """As it was looked at last, completed from memory."""
+    known: Mapping[str, SceneObject] = field(default_factory=dict[str, SceneObject])
+    """Where each object was last seen or placed since the scene was arranged, by name. Never changed, only replaced."""
+    remembered: tuple[str, ...] = ()
+    """Objects of that scene that the look did not show."""
     transfer: Transfer | None = None
     """Requested, and its effect not seen yet."""
     remainder: tuple[Transfer, ...] = ()
@@ -73,7 +83,8 @@ class State:
 class Demonstrator(Stage):
     """Remembers a demonstrated scene as the goal and drives the robot until it holds again.
 
-    One :class:`State` and no clock. After each transfer the scene is perceived again and planned from again,
+    One :class:`State` and no clock. What a look does not show counts as being where it was last seen or placed, unless
+    that place is seen empty. After each transfer the scene is perceived again and planned from again,
     since targets depend on poses; comparing the new plan with what the old one still had to do says whether
     the plan was kept, repaired or replaced. Every way through ends in exactly one verdict; without the script
     the next command may follow.
@@ -116,6 +127,7 @@ class Demonstrator(Stage):
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
+        self._memory = Memory(self._catalogue)
         self._state = State(goal_name=config.goal_name) if config.scripted else State(phase=Phase.IDLE)
 
     def on_start(self, ctx: Context) -> Arrangement:
@@ -145,19 +157,26 @@ class Demonstrator(Stage):
         return self._look(self._state.purpose) if self._state.phase is Phase.ARRANGING else None
 
     def on_scene_graph(
-        self, scene_graph: SceneGraph, ctx: Context
+        self, scene_graph: SceneGraph, observation: Observation, ctx: Context
     ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict]:
         """Remembers the goal, or compares the scene with it and asks for a plan where they differ."""
         if self._state.phase is not Phase.LOOKING:
             return
-        self._state = replace(self._state, scene=scene_graph, looks=self._state.looks + 1)
-        missing = self._missing(scene_graph)
+        scene = self._memory.complete(scene_graph, self._state.known, observation)
+        self._state = replace(
+            self._state,
+            scene=scene,
+            known={item.name: item for item in scene.objects},
+            remembered=tuple(sorted(_names(scene) - _names(scene_graph))),
+            looks=self._state.looks + 1,
+        )
+        missing = self._missing(scene)
         if missing:
             yield self._look_again("perception", missing, ctx)
         elif self._state.goal is None:
-            yield from self._remember(scene_graph, ctx)
+            yield from self._remember(scene, ctx)
         else:
-            yield self._compare(self._state.goal, scene_graph, ctx)
+            yield self._compare(self._state.goal, scene, ctx)
 
     def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
         """Starts the plan's first transfer, or gives up where there is none."""
@@ -182,7 +201,7 @@ class Demonstrator(Stage):
             f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
             level="info" if outcome.success else "warning",
         )
-        self._state = replace(self._state, complaint=complaint, repeats=0)
+        self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
 
     def _begin(self, name: str, goal: SceneGraph | None) -> None:
@@ -204,12 +223,20 @@ class Demonstrator(Stage):
         ctx.log(f"{why}; looking again", level="warning")
         return self._look(self._state.purpose)
 
+    def _known_after(self, outcome: Outcome) -> Mapping[str, SceneObject]:
+        """Where objects are known to be once a transfer has ended: what was let go of is where that was."""
+        known = self._state.known
+        if outcome.T_base_object is None or outcome.object not in known:
+            return known
+        placed = msgspec.structs.replace(known[outcome.object], T_base_object=outcome.T_base_object)
+        return {**known, outcome.object: placed}
+
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""
         if self._state.goal is None:
             few = len(scene.objects) < self._config.n_objects
             return f"{len(scene.objects)} of {self._config.n_objects} objects seen" if few else ""
-        names = {item.name for item in self._state.goal.objects} - {item.name for item in scene.objects}
+        names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
@@ -218,16 +245,18 @@ class Demonstrator(Stage):
         yield Goal(name=name, scene=scene, pddl=goal_pddl(name, scene))
         self._state = replace(self._state, goals=goals, goal=scene, phase=Phase.IDLE, repeats=0)
         if self._config.scripted:
-            self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start")
+            self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start", known={})
             yield Arrangement(kind="start")
 
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
         self._check_transfer(scene)
         held, violated = satisfied(goal, scene, self._catalogue)
-        ctx.log(f"scene '{self._state.purpose}': {len(held)} of {len(held) + len(violated)} goal relations hold")
+        from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
+        count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
+        ctx.log(f"scene '{self._state.purpose}': {count}{from_memory}")
         if not violated:
-            return self._conclude("", "every relation of the goal holds", ctx)
+            return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
         if self._state.transfers == self._config.max_transfers:
             why = self._state.complaint or f"{violated[0]} does not hold"
             return self._fail("executor", f"{self._state.transfers} transfers were not enough; {why}", ctx)
@@ -289,6 +318,10 @@ class Demonstrator(Stage):
             plans=state.plans,
             transfers=state.transfers,
         )
+
+
+def _names(scene: SceneGraph) -> set[str]:
+    return {item.name for item in scene.objects}
 
 
 def _refuse_odd_name(place: str, name: str) -> None:

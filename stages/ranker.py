@@ -36,4 +36,5 @@ class Ranker(Stage):
             scene_id=observation.scene_id,
             image_id=observation.image_id,
             name=observation.name,
+            support=observation.support,
         )

@@ -20,10 +20,13 @@ from stages.perception.scoring import errors
 from stages.scene.catalogue import Catalogue
 from stages.scene.episode import Episode, Look, markdown, plain, title
 from stages.scene.text import certainty
+from stages.scene.truth import Truth
 
 
 class Report(Stage):
-    """The only reader of the simulator's truth besides the camera that renders it: to score perception.
+    """The only reader of the simulator's truth besides the camera that renders it: to score perception and to judge.
+
+    The graph succeeds where the verdict does and the truth does not deny it.
 
     Messages of different stages arrive in any order. The verdict says how many looks, plans and transfers led
     to it, and the report ends once it has all of them.
@@ -33,17 +36,18 @@ class Report(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """What perception is scored with."""
+        """What perception is scored and the end is judged with."""
 
         catalogue: Path
 
     def __init__(self, config: Config) -> None:
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._looks: list[tuple[int, Look]] = []
+        self._truth = Truth(self._catalogue)
+        self._looks: list[tuple[int, Look, Snapshot]] = []
         self._plans: list[Plan] = []
         self._outcomes: dict[int, Outcome] = {}
         self._restarts: list[str] = []
-        self._goals = 0
+        self._goals: dict[str, Goal] = {}
         self._verdict: Verdict | None = None
 
     def on_look(
@@ -64,12 +68,12 @@ class Report(Stage):
             errors=errors(snapshot.names, snapshot.T_base_objects, scene_graph.objects, self._catalogue),
             certainty=certainty(scene_estimate),
         )
-        self._looks.append((ctx.time_ns, look))
+        self._looks.append((ctx.time_ns, look, snapshot))
         return self._finish(ctx)
 
     def on_goal(self, goal: Goal, ctx: Context) -> Finished | None:
         """Writes the remembered goal."""
-        self._goals += 1
+        self._goals[goal.name] = goal
         _write(ctx.directory / f"goal-{goal.name}.pddl", goal.pddl)
         return self._finish(ctx)
 
@@ -101,18 +105,26 @@ class Report(Stage):
         verdict = self._verdict
         if verdict is None or not self._complete(verdict):
             return None
-        episode = Episode(
-            verdict=verdict,
-            looks=tuple(look for _, look in sorted(self._looks, key=lambda item: item[0])),
-            plans=tuple(self._plans),
-            outcomes=tuple(self._outcomes[number] for number in sorted(self._outcomes)),
-            restarts=tuple(self._restarts),
-        )
+        episode = self._episode(verdict)
         text = plain(episode)
         _write(ctx.directory / "report.txt", text)
         _write(ctx.directory / "report.md", markdown(episode))
         ctx.log("\n" + text)
-        return Finished(code=0 if verdict.success else 1, reason=title(verdict))
+        good = verdict.success and not episode.judgement.false_success
+        return Finished(code=0 if good else 1, reason=title(episode))
+
+    def _episode(self, verdict: Verdict) -> Episode:
+        looks = sorted(self._looks, key=lambda item: item[0])
+        outcomes = tuple(self._outcomes[number] for number in sorted(self._outcomes))
+        snapshots = [snapshot for *_, snapshot in looks]
+        return Episode(
+            verdict=verdict,
+            looks=tuple(look for _, look, _ in looks),
+            plans=tuple(self._plans),
+            outcomes=outcomes,
+            judgement=self._truth.judge(snapshots, self._goals.get(verdict.goal_name), verdict, outcomes),
+            restarts=tuple(self._restarts),
+        )
 
     def _complete(self, verdict: Verdict) -> bool:
         """Relations are compared with a goal, so it must have come too."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.contract import Refused, Stage
 from stages.messages import SceneEstimate, SceneGraph
-from stages.messages.scene import SceneObject
+from stages.messages.scene import ObjectPose, SceneObject
 from stages.perception.poses import inverse
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue, Floats
@@ -16,7 +17,7 @@ from stages.scene.standing import Stances, Standing
 
 
 class SceneGraphBuilder(Stage):
-    """Asserts exist, clear, on, in and has of every estimated scene."""
+    """Asserts exist, clear, on, in and has of every estimated scene, without the objects that the image contradicts."""
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
@@ -42,16 +43,17 @@ class SceneGraphBuilder(Stage):
 
     def on_scene_estimate(self, scene_estimate: SceneEstimate) -> SceneGraph:
         """The scene graph of an estimate; objects the catalogue does not hold are refused."""
+        found = [item for item in scene_estimate.objects if not item.contradicted]
         T_table_camera = inverse(scene_estimate.T_camera_table)
         standing = [
             Standing.at(item.name, self._stances_of(item.label), T_table_camera @ item.T_camera_object)
-            for item in scene_estimate.objects
+            for item in found
         ]
         supports = relations.supports(standing, self._config.tolerances)
         regions = virtual.virtual_objects(standing, supports, gap=self._config.gap, radius=self._config.radius)
         T_base_camera = scene_estimate.T_base_camera if scene_estimate.T_base_camera is not None else T_table_camera
         return SceneGraph(
-            objects=_objects(scene_estimate, T_base_camera),
+            objects=_objects(found, T_base_camera),
             virtual_objects=regions,
             assertions=(*relations.assertions(supports), *virtual.assertions(regions)),
             T_base_table=T_base_camera @ scene_estimate.T_camera_table,
@@ -60,6 +62,7 @@ class SceneGraphBuilder(Stage):
             name=scene_estimate.name,
             scene_id=scene_estimate.scene_id,
             image_id=scene_estimate.image_id,
+            support=scene_estimate.support,
         )
 
     def _stances_of(self, label: str) -> Stances:
@@ -69,8 +72,8 @@ class SceneGraphBuilder(Stage):
         return self._stances[label]
 
 
-def _objects(estimate: SceneEstimate, T_base_camera: Floats) -> tuple[SceneObject, ...]:
+def _objects(found: Sequence[ObjectPose], T_base_camera: Floats) -> tuple[SceneObject, ...]:
     return tuple(
         SceneObject(name=item.name, label=item.label, T_base_object=T_base_camera @ item.T_camera_object)
-        for item in estimate.objects
+        for item in found
     )

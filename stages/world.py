@@ -12,6 +12,7 @@ from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
 from stages.messages import Arrange, Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.perception.poses import pose
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01
@@ -65,6 +66,7 @@ class World(Stage):
             joint_positions=self._simulation.encoders(),
             time=self._simulation.time,
             purpose=look_request.purpose,
+            T_base_table=pose(np.eye(3), np.array([*tabletop.TABLE.center, tabletop.TABLE.height])),
         )
 
     def on_robot_command(self, robot_command: RobotCommand) -> RobotState:

@@ -38,6 +38,7 @@ class Simulation:
         option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
         # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
         option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
         add_table(spec, tabletop.TABLE)
         for name in names:
             _add_object(spec, name, catalogue[name])

@@ -35,6 +35,8 @@ class Observation(Message, frozen=True, kw_only=True):
     scene_id: int = 0
     image_id: int = 0
     name: str = ""
+    support: Matrix | None = None
+    """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
 
 
 class ParticleTrace(Struct, frozen=True, kw_only=True):
@@ -134,3 +136,5 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """Of each hypothesis, summing to 1: ``log_weights`` after calibration; None where they were not judged."""
     unknown: tuple[UnknownRegion, ...] = ()
     """What no object explains, the largest first."""
+    support: Matrix | None = None
+    """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""

@@ -3,7 +3,7 @@
 from typing import Literal
 
 from runner.contract import Message, Struct
-from stages.messages.arrays import Box, Intrinsics, Pose, Vector
+from stages.messages.arrays import Box, Intrinsics, Matrix, Pose, Vector
 
 Predicate = Literal["exist", "clear", "on", "in", "has"]
 
@@ -100,3 +100,5 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     name: str = ""
     scene_id: int = 0
     image_id: int = 0
+    support: Matrix | None = None
+    """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""

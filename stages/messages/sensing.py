@@ -27,6 +27,8 @@ class Snapshot(Message, frozen=True, kw_only=True):
     time: float
     """Simulated seconds."""
     purpose: str = ""
+    T_base_table: Pose | None = None
+    """The table's surface: z up, the origin in its middle; None in recordings that are older."""
 
 
 class Frame(Message, frozen=True, kw_only=True):

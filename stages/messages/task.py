@@ -3,7 +3,7 @@
 from typing import Literal
 
 from runner.contract import Command, Message, Struct
-from stages.messages.arrays import Poses
+from stages.messages.arrays import Pose, Poses
 from stages.messages.scene import Assertion, SceneGraph
 
 FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release"]
@@ -89,6 +89,8 @@ class Outcome(Message, frozen=True, kw_only=True):
     attempts: int
     robot_seconds: float
     planning_seconds: float
+    T_base_object: Pose | None = None
+    """Where the hand let go of the object; None where it did not."""
 
 
 class Verdict(Message, frozen=True, kw_only=True):

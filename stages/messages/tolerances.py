@@ -26,7 +26,8 @@ WEIGHT = Tolerance(0.1)
 IMAGE = Tolerance(share=1e-3)
 """A reading at a threshold falls on the other side."""
 SHOWN = Tolerance(math.inf)
-"""How a filter came to its result, and where it starts: of symmetric poses another one may come first."""
+"""How a filter came to its result, and where it starts: of symmetric poses another one may come first. And the corners
+of a hull, of which there may be one more or less."""
 
 TOLERANCES = {
     "Candidate.box": PIXELS,
@@ -35,6 +36,7 @@ TOLERANCES = {
     "Observation.depth": IMAGE,
     "Observation.foreground": IMAGE,
     "Observation.T_camera_table": PLANE,
+    "Observation.support": SHOWN,
     "ParticleTrace.iterations": SHOWN,
     "ParticleTrace.costs": SHOWN,
     "ParticleTrace.positions": SHOWN,

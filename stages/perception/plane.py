@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.perception.poses import pose
 from stages.perception.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats
+from stages.scene.regions import EMPTY, Region, hull
 
 _SAMPLES = 6000
 _TRIALS = 400
@@ -22,6 +24,11 @@ _SHARE = 0.1
 """Of the readings near the objects as many must lie on the support plane; on real tables a third and more do."""
 _BELOW = 0.5
 """What a reading below the plane takes away, in readings on it."""
+_CELL = 0.01
+_PER_CELL = 3
+"""Readings that show a cell of the support surface."""
+_BRIDGED = 11
+"""Cells across which parts of one surface may lie apart, because of what stands between."""
 _TALLEST = 0.3
 """Metres above the plane below which the middle of an object lies."""
 
@@ -52,6 +59,34 @@ def height_above(depth: Float32s, view: View, T_camera_table: Floats) -> Float32
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
     slope = (view.rays() * normal).sum(-1)
     return (slope * depth - (normal * origin).sum()).astype(np.float32)
+
+
+def support_region(depth: Float32s, view: View, T_camera_table: Floats) -> Region:
+    """Where the support surface is seen: the corners of its convex hull in the table's frame, K x 2 metres.
+
+    Readings on the plane are counted on a grid of 1 cm, so that single stray ones do not widen it. Of several parts far
+    from each other, which are other surfaces at the same height, the one with most cells counts.
+    """
+    on_it = (depth > 0) & (np.abs(height_above(depth, view, T_camera_table)) < noise(depth))
+    points = (view.rays()[on_it] * depth[on_it][:, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
+    cells = np.floor(points / _CELL).astype(np.int64)
+    if not len(cells):
+        return EMPTY
+    low = cells.min(0)
+    counts = np.zeros(cells.max(0) - low + 1, np.int64)
+    np.add.at(counts, tuple((cells - low).T), 1)
+    rows, columns = np.nonzero(_largest_part(counts >= _PER_CELL))
+    return hull((np.stack([rows, columns], 1) + low + 0.5) * _CELL)
+
+
+def _largest_part(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells of the part that has most; what objects hide does not part a surface."""
+    disc = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRIDGED, _BRIDGED)), np.uint8)
+    padded = np.pad(cells, _BRIDGED).astype(np.uint8)
+    _, labels = cv2.connectedComponents(cv2.dilate(padded, disc), connectivity=8)
+    inner = labels[_BRIDGED:-_BRIDGED, _BRIDGED:-_BRIDGED]
+    sizes = np.bincount(inner[cells], minlength=1)
+    return cells & (inner == sizes.argmax())
 
 
 def noise(z: NDArray[np.floating]) -> NDArray[np.floating]:

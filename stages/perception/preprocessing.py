@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from runner.contract import Refused
 from stages.messages.digest import Candidate, Observation
 from stages.messages.sensing import Frame
-from stages.perception.plane import find_plane, height_above, noise
+from stages.perception.plane import find_plane, height_above, noise, support_region
 from stages.perception.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats
 
@@ -47,7 +47,14 @@ def preprocess(
         scene_id=frame.scene_id,
         image_id=frame.image_id,
         name=frame.name,
+        support=support_region(_without_robot(frame, measured), view, T_camera_table),
     )
+
+
+def _without_robot(frame: Frame, measured: NDArray[np.bool_]) -> Float32s:
+    """All readings of the frame, 0 where there is none or the robot is."""
+    seen = measured if frame.robot_mask is None else measured & ~frame.robot_mask
+    return np.where(seen, frame.depth, np.float32(0))
 
 
 def _no_plane(frame: Frame, depth: Float32s) -> str:

@@ -33,7 +33,7 @@ def errors(
 
     No perceived object answers for two true ones.
     """
-    labels = [_label(name, catalogue) for name in names]
+    labels = [label_of(name, catalogue) for name in names]
     matched: dict[int, SceneObject] = {}
     for label in dict.fromkeys(labels):
         truth = [k for k, other in enumerate(labels) if other == label]
@@ -47,7 +47,7 @@ def errors(
     )
 
 
-def _label(name: str, catalogue: Catalogue) -> str:
+def label_of(name: str, catalogue: Catalogue) -> str:
     """The catalogue's name of a scene's object: ``cup`` for ``cup_2``."""
     return name if name in catalogue.objects else name.rpartition("_")[0]
 

@@ -13,7 +13,8 @@ from stages.planning.problem import TABLE, carriers
 from stages.planning.search import Step
 from stages.scene import regions
 from stages.scene.catalogue import CatalogueObject, Floats
-from stages.scene.standing import ALIGNED, Stances, Standing, yawed
+from stages.scene.regions import Region
+from stages.scene.standing import ALIGNED, Stances, Standing, standing_of, yawed
 from stages.scene.virtual import region_poses
 
 QUARTERS = 4
@@ -32,16 +33,14 @@ class Scene:
     standing: Mapping[str, Standing]
     supports: Mapping[str, str]
     T_base_table: Floats
+    surface: Region | None = None
+    """Of the table, in its frame, as far as it was seen; None where that is not known."""
 
     @staticmethod
     def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
         """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy."""
-        T_table_base = inverse(graph.T_base_table)
-        standing = {
-            item.name: Standing.at(item.name, stances[item.label], T_table_base @ item.T_base_object)
-            for item in graph.objects
-        }
-        scene = Scene({}, carriers(graph), graph.T_base_table)
+        standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
+        scene = Scene({}, carriers(graph), graph.T_base_table, graph.support)
         while standing:
             name = next(name for name in standing if scene.supports[name] not in standing)
             item = standing.pop(name)

@@ -38,6 +38,8 @@ class Workspace:
     y: tuple[float, float] = (-0.42, 0.42)
     clearance: float = 0.005
     """Least gap between footprints."""
+    edge: float = 0.02
+    """Least distance of a footprint from the edge of the table, as far as that was seen."""
     spacing: float = 0.06
     """Gap that objects put aside should keep."""
     targets: int = 12
@@ -143,14 +145,20 @@ class Targets:
         return valid or Blocked(step, min(blocking, key=lambda hit: _effort(hit, scene), default=()))
 
     def _supported(self, item: Standing, destination: str, scene: Scene, *, strict: bool) -> bool:
-        """Whether the surface carries the object: within reach of the arm, inside the cavity, or by its middle."""
+        """Whether the surface carries the object: wholly and within reach, inside the cavity, or by its middle."""
         if destination == TABLE:
-            return self._workspace.outside(scene.T_base_table @ item.T_table_object) == 0
+            within_reach = self._workspace.outside(scene.T_base_table @ item.T_table_object) == 0
+            return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
         if strict and carrier.stance.cavity:
             return regions.inside(item.bottom, surface)
         return bool(regions.depth(surface, regions.centroid(item.bottom)[None])[0] >= 0)
+
+    def _on_table(self, item: Standing, scene: Scene) -> bool:
+        """Whether all of an object, seen from above, lies over the table and away from its edge."""
+        surface = scene.surface
+        return surface is None or regions.inside(item.outline, surface, margin=self._workspace.edge)
 
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> list[Placement] | Blocked:
         """Places on the table, near and with space around them, where nothing of the goal will stand."""
@@ -159,6 +167,8 @@ class Targets:
         reserved = self._placements.reserved(pending, scene)
         spots: list[Placement] = []
         for spot in self._grid(item, scene):
+            if not self._on_table(spot, scene):
+                continue
             room = min((_clearance(spot, other) for other in others), default=np.inf)
             free = min((regions.separation(spot.outline, other.outline) for other in reserved), default=np.inf)
             if room < self._workspace.clearance:

@@ -41,6 +41,8 @@ class _Tally:
     started: float = 0.0
     clock: float = 0.0
     grasp: str = ""
+    T_base_object: Floats | None = None
+    """Where the hand let go of the object."""
 
 
 class TransferRoutine:
@@ -137,7 +139,8 @@ class TransferRoutine:
         q = yield from self._lower_until_contact(world, state, plan.place.lower[-1], hand.T_base_hand)
         held, wanted = state.gripper_width, state.gripper_width + 2 * RELEASE
         state = yield self._command(f"let go of {world.carried}", width=wanted)
-        world.move(world.hand(q) @ inverse(plan.pick.hand.T_object_hand))
+        left = world.hand(q) @ inverse(plan.pick.hand.T_object_hand)
+        world.move(left)
         retreat = planner.retreat(hand, q)
         retreat = plan.place.lower[::-1] if retreat is None else retreat
         yield self._command("retreat", retreat, speed=_SLOW)
@@ -146,6 +149,7 @@ class TransferRoutine:
         failure = yield from self._home(world, retreat[-1])
         if state.gripper_width < held + RELEASE:
             return "release", f"the hand opened to {1e3 * state.gripper_width:.0f} mm of {1e3 * wanted:.0f}"
+        self._tally.T_base_object = left
         return failure
 
     def _lower_until_contact(
@@ -244,4 +248,5 @@ class TransferRoutine:
             attempts=tally.attempts,
             robot_seconds=tally.clock - tally.started,
             planning_seconds=tally.planning_seconds,
+            T_base_object=tally.T_base_object,
         )

@@ -11,6 +11,7 @@ from textwrap import fill
 from stages.messages import Assertion, Outcome, Plan, SceneGraph, Verdict
 from stages.perception.scoring import ObjectError
 from stages.scene.text import tree
+from stages.scene.truth import Judgement
 
 WIDTH = 98
 Section = tuple[str, list[str]]
@@ -38,14 +39,20 @@ class Episode:
     looks: tuple[Look, ...]
     plans: tuple[Plan, ...]
     outcomes: tuple[Outcome, ...]
+    judgement: Judgement
     restarts: tuple[str, ...] = ()
 
 
-def title(verdict: Verdict) -> str:
-    """The verdict in one line."""
+def title(episode: Episode) -> str:
+    """The verdict in one line, and what the truth has against it."""
+    verdict, judgement = episode.verdict, episode.judgement
+    if judgement.false_success:
+        broken = ", ".join(map(str, judgement.violated))
+        return f'Goal "{verdict.goal_name}" NOT restored. FALSE SUCCESS: in truth {broken} does not hold'
     if verdict.success:
         return f'Goal "{verdict.goal_name}" restored: {verdict.reason}'
-    return f'Goal "{verdict.goal_name}" NOT restored. {verdict.failed_stage}: {verdict.reason}'
+    but = " (in truth every relation holds)" if judgement.restored else ""
+    return f'Goal "{verdict.goal_name}" NOT restored. {verdict.failed_stage}: {verdict.reason}{but}'
 
 
 def sections(episode: Episode) -> list[Section]:
@@ -55,6 +62,7 @@ def sections(episode: Episode) -> list[Section]:
         ("Plan", _plan(episode.plans)),
         ("Actions", _actions(episode.outcomes)),
         ("Relations of the goal", _relations(episode.verdict)),
+        ("The end by the simulator's truth", _truth(episode.judgement)),
         ("Perception against the simulator's truth", _perception(episode.looks)),
         ("Time and effort", _effort(episode)),
     ]
@@ -65,13 +73,13 @@ def plain(episode: Episode) -> str:
     blocks = [
         f"{heading}\n" + "\n".join(f"  {line}".rstrip() for line in lines) for heading, lines in sections(episode)
     ]
-    return "\n\n".join([f"{fill(title(episode.verdict), WIDTH)}\n{'=' * WIDTH}", *blocks]) + "\n"
+    return "\n\n".join([f"{fill(title(episode), WIDTH)}\n{'=' * WIDTH}", *blocks]) + "\n"
 
 
 def markdown(episode: Episode) -> str:
     """The report for a browser."""
     blocks = [f"## {heading}\n```\n" + "\n".join(lines) + "\n```" for heading, lines in sections(episode)]
-    return "\n\n".join([f"# {title(episode.verdict)}", *blocks]) + "\n"
+    return "\n\n".join([f"# {title(episode)}", *blocks]) + "\n"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list[str]:
@@ -142,6 +150,17 @@ def _relations(verdict: Verdict) -> list[str]:
     pairs = list(zip_longest(cells[:half], cells[half:], fillvalue=""))
     count = f"{len(verdict.satisfied)} of {len(marked)} hold"
     return [count, *(f"{left:<47}{right}".rstrip() for left, right in pairs)]
+
+
+def _truth(judgement: Judgement) -> list[str]:
+    """How much holds, then whatever is not as it was said or not as anybody wanted it."""
+    count = len(judgement.held) + len(judgement.violated)
+    if not count:
+        return ["no goal was taught"]
+    unsaid = sum(not loss.said for loss in judgement.losses)
+    lost = f"objects lost or knocked over: {len(judgement.losses)}, {unsaid} of them unsaid"
+    told = [*judgement.differences, *map(str, judgement.losses)]
+    return [f"{len(judgement.held)} of {count} hold; {lost}", *(_clip(line, WIDTH - 2) for line in told)]
 
 
 def _reading_order(marked: tuple[Assertion, str]) -> tuple[bool, int]:

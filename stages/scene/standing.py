@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.messages.scene import SceneObject
 from stages.perception.poses import inverse, rotate
 from stages.scene import regions
 from stages.scene.catalogue import CatalogueObject
@@ -264,3 +266,9 @@ class Standing:
         if cavity is None:
             return self.z_top
         return self.z + cavity.height(regions.moved(region, inverse(self.T_table_stance)))
+
+
+def standing_of(objects: Iterable[SceneObject], stances: Mapping[str, Stances], T_base_table: Floats) -> list[Standing]:
+    """Objects of a scene graph where they stand."""
+    T_table_base = inverse(T_base_table)
+    return [Standing.at(item.name, stances[item.label], T_table_base @ item.T_base_object) for item in objects]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from stages.messages import (
     Arrangement,
     Goal,
     LookRequest,
+    Observation,
     Restore,
     RobotState,
     SceneGraph,
@@ -20,12 +22,38 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
+from stages.perception.poses import inverse
+from stages.scene.catalogue import Floats
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
+from tests.stages.layouts import T_BASE_TABLE, Layout
+from tests.stages.perception.scenes import K, camera, render, upright
 
 GOAL = scene({"tray": "table", "cup": "tray", "soup_can": "table"}, beside={"soup_can": "tray"})
 START = scene({"tray": "table", "soup_can": "table", "cup": "soup_can"}, beside={})
 STEP = transfer("cup", "soup_can", "tray")
 STILL = RobotState(joint_names=(), positions=np.zeros(0), gripper_width=0.1, time=0.0)
+BLIND = Observation(
+    depth=np.zeros((2, 2), np.float32), rgb=np.zeros((2, 2, 3), np.uint8), foreground=np.zeros((2, 2), np.bool_),
+    K=np.eye(3), T_camera_table=np.eye(4), T_base_camera=None,
+)  # fmt: skip
+"""Shows nothing, not even that a place is empty."""
+LOOK = camera()
+CARTON = Layout({"milk_carton": upright("milk_carton", 0.0, -0.05, 0.0)})
+HIDDEN = upright("salt_shaker", 0.0, 0.04, 0.0)
+OPEN = upright("salt_shaker", 0.15, -0.1, 0.0)
+
+
+def with_shaker(T_table_object: Floats) -> Layout:
+    return Layout({**CARTON.poses, "salt_shaker": T_table_object})
+
+
+def view(layout: Layout) -> Observation:
+    """What the camera sees of a layout."""
+    scene = render(layout.poses).scene
+    return Observation(
+        depth=scene.depth, rgb=np.zeros((*scene.depth.shape, 3), np.uint8), foreground=scene.foreground, K=K,
+        T_camera_table=LOOK, T_base_camera=T_BASE_TABLE @ inverse(LOOK),
+    )  # fmt: skip
 
 
 class Episode:
@@ -44,14 +72,15 @@ class Episode:
     def arranged(self) -> list[Message]:
         return self.take(self.stage.on_robot_state(STILL, self.ctx))
 
-    def seen(self, graph: SceneGraph) -> list[Message]:
-        return self.take(self.stage.on_scene_graph(graph, self.ctx))
+    def seen(self, graph: SceneGraph, observation: Observation = BLIND) -> list[Message]:
+        return self.take(self.stage.on_scene_graph(graph, observation, self.ctx))
 
     def planned(self, *transfers: Transfer, **fields: str) -> list[Message]:
         return self.take(self.stage.on_plan(plan(*transfers, **fields), self.ctx))
 
-    def ended(self, number: int, item: Transfer, **fields: str) -> list[Message]:
-        return self.take(self.stage.on_outcome(outcome(number, item, **fields), self.ctx))
+    def ended(self, number: int, item: Transfer, *, at: Floats | None = None, **fields: str) -> list[Message]:
+        ending = msgspec.structs.replace(outcome(number, item, **fields), T_base_object=at)
+        return self.take(self.stage.on_outcome(ending, self.ctx))
 
     def called(self, command: Teach | Restore) -> list[Message]:
         handler = self.stage.on_teach if isinstance(command, Teach) else self.stage.on_restore
@@ -189,6 +218,60 @@ def test_an_object_found_on_the_second_look_goes_on() -> None:
     episode.ended(1, STEP)
     episode.seen(scene({"tray": "table", "soup_can": "table"}))
     assert the_verdict(episode.seen(GOAL)).success
+
+
+def until_hidden(*, at: Floats | None) -> Episode:
+    """The shaker, which stood in the open, has been moved behind the carton; ``at`` is where the hand let go of it."""
+    episode = Episode(repeats=1)
+    episode.until_task(with_shaker(HIDDEN).graph(), with_shaker(OPEN).graph())
+    step = transfer("salt_shaker", "table", "table")
+    episode.planned(step)
+    episode.ended(1, step, at=at)
+    return episode
+
+
+def test_an_object_that_is_hidden_counts_as_being_where_it_was_placed() -> None:
+    episode = until_hidden(at=T_BASE_TABLE @ HIDDEN)
+    verdict = the_verdict(episode.seen(CARTON.graph(), view(with_shaker(HIDDEN))))
+    assert verdict.success and "remembered, not seen: salt_shaker" in verdict.reason
+
+
+def test_an_object_that_something_was_placed_in_front_of_counts_as_being_where_it_was_seen() -> None:
+    aside = Layout({"milk_carton": upright("milk_carton", -0.15, -0.1, 0.0), "salt_shaker": HIDDEN})
+    episode = Episode()
+    episode.until_task(with_shaker(HIDDEN).graph(), aside.graph())
+    step = transfer("milk_carton", "table", "table")
+    episode.planned(step)
+    episode.ended(1, step)
+    verdict = the_verdict(episode.seen(CARTON.graph(), view(with_shaker(HIDDEN))))
+    assert verdict.success and "salt_shaker" in verdict.reason
+
+
+def test_an_object_whose_place_is_seen_empty_is_looked_for_then_named() -> None:
+    episode = until_hidden(at=None)
+    seen = CARTON.graph(), view(CARTON)
+    assert episode.seen(*seen) == [LookRequest(purpose="after transfer 1, look 2")]
+    verdict = the_verdict(episode.seen(*seen))
+    assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
+
+
+def test_memory_ends_where_somebody_lays_the_scene_out_anew() -> None:
+    episode = Episode()
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    episode.seen(with_shaker(HIDDEN).graph(), view(with_shaker(HIDDEN)))
+    episode.arranged()
+    assert episode.seen(CARTON.graph(), view(with_shaker(HIDDEN))) == [LookRequest(purpose="start, look 2")]
+
+
+def test_looks_at_one_scene_complete_each_other() -> None:
+    episode = Episode(n_objects=2)
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    everything, shaker = with_shaker(HIDDEN), Layout({"salt_shaker": HIDDEN})
+    assert episode.seen(shaker.graph(), view(everything)) == [LookRequest(purpose="goal, look 2")]
+    goal, _ = episode.seen(CARTON.graph(), view(everything))
+    assert isinstance(goal, Goal) and {item.name for item in goal.scene.objects} == {"milk_carton", "salt_shaker"}
 
 
 def test_a_goal_with_too_few_objects_is_not_remembered() -> None:

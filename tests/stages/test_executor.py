@@ -97,6 +97,8 @@ def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
         wanted, after = before[destination] @ T_destination_object, bench.poses()
         assert np.linalg.norm(after[name][:3, 3] - wanted[:3, 3]) < 0.02
         assert after[name][2, 2] > 0.99
+        assert outcome.T_base_object is not None
+        assert np.linalg.norm(outcome.T_base_object[:3, 3] - after[name][:3, 3]) < 0.01
         others = set(after) - {name}
         assert all(np.linalg.norm(after[o][:3, 3] - before[o][:3, 3]) < 0.01 for o in others)
         assert bench.is_home()
@@ -127,6 +129,7 @@ def test_a_missing_object_fails_in_grasp() -> None:
     outcome = bench.transfer(poses, "salt_shaker", "table", standing("salt_shaker", 0.6, 0.0, height=0.75))
     assert (outcome.success, outcome.failed_stage) == (False, "grasp")
     assert outcome.attempts == 2
+    assert outcome.T_base_object is None
     assert bench.is_home()
 
 

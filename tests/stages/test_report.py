@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from runner.contract import Finished, Restarted
 from stages.messages import Candidates, Goal, SceneEstimate, SceneGraph, Snapshot, Verdict
 from stages.report import Report
-from tests.stages.episodes import CATALOGUE, K, Recorded, outcome, plan, scene, transfer
+from tests.stages.episodes import CATALOGUE, K, Recorded, outcome, plan, transfer
+from tests.stages.layouts import Layout
 
-GOAL = scene({"tray": "table", "cup": "tray", "soup_can": "table"}, beside={"soup_can": "tray"})
-START = scene({"tray": "table", "soup_can": "table", "cup": "soup_can"})
+TRAY = Layout().put("tray", 0.0, 0.0).put("soup_can", 0.0, 0.2)
+GOAL = Layout(dict(TRAY.poses)).put("cup", 0.0, 0.0, on="tray").graph()
+START = Layout(dict(TRAY.poses)).put("cup", 0.0, 0.0, on="soup_can").graph()
 STEP = transfer("cup", "soup_can", "tray")
 Arrival = Callable[[Report, Recorded], Finished | None]
 
@@ -35,7 +37,7 @@ def truth(graph: SceneGraph, purpose: str, *, shift: float = 0.002) -> Snapshot:
     )
 
 
-def look(time_ns: int, purpose: str, graph: SceneGraph) -> Arrival:
+def look(time_ns: int, purpose: str, graph: SceneGraph, *, true: SceneGraph | None = None) -> Arrival:
     def arrive(report: Report, ctx: Recorded) -> Finished | None:
         ctx.time_ns = time_ns
         candidates = Candidates(candidates=(), labels=("cup",), confidences=np.zeros((0, 1)))
@@ -48,7 +50,7 @@ def look(time_ns: int, purpose: str, graph: SceneGraph) -> Arrival:
             T_base_camera=None,
             K=K,
         )
-        return report.on_look(truth(graph, purpose), candidates, estimate, graph, ctx)
+        return report.on_look(truth(true or graph, purpose), candidates, estimate, graph, ctx)
 
     return arrive
 
@@ -68,8 +70,8 @@ def verdict(*, success: bool) -> Verdict:
     )
 
 
-def episode(*, success: bool = True) -> list[Arrival]:
-    """Everything that reaches the report, in causal order."""
+def episode(*, success: bool = True, true: SceneGraph | None = None) -> list[Arrival]:
+    """Everything that reaches the report, in causal order; in the end the ``true`` scene is the perceived one."""
     failure = {} if success else {"failed_stage": "ik", "reason": "no grasp of cup is reachable"}
     return [
         look(10, "goal", GOAL),
@@ -77,7 +79,7 @@ def episode(*, success: bool = True) -> list[Arrival]:
         look(20, "start", START),
         lambda report, ctx: report.on_plan(plan(STEP), ctx),
         lambda report, ctx: report.on_outcome(outcome(1, STEP, **failure), ctx),
-        look(30, "after transfer 1", GOAL if success else START),
+        look(30, "after transfer 1", GOAL if success else START, true=true),
         lambda report, ctx: report.on_verdict(verdict(success=success), ctx),
     ]
 
@@ -103,6 +105,15 @@ def test_a_failed_episode_exits_with_the_failing_stage(tmp_path: Path) -> None:
     assert finished.code == 1
     assert "executor" in finished.reason and "no grasp of cup is reachable" in finished.reason
     assert "FAILED at ik" in (tmp_path / "report.txt").read_text()
+
+
+def test_a_success_that_the_truth_denies_exits_with_what_does_not_hold(tmp_path: Path) -> None:
+    (finished,), _ = run(episode(true=START), tmp_path)
+    assert finished.code == 1
+    assert "FALSE SUCCESS" in finished.reason and "in(cup, tray)" in finished.reason
+    text = (tmp_path / "report.txt").read_text()
+    assert "in(cup, tray) holds by perception and does not hold in truth" in text
+    assert "objects lost or knocked over: 0, 0 of them unsaid" in text
 
 
 @settings(max_examples=25, deadline=None)

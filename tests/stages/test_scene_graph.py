@@ -32,6 +32,20 @@ def test_an_empty_scene_has_an_empty_graph():
     assert builder().on_scene_estimate(estimate).assertions == ()
 
 
+def test_what_the_image_contradicts_is_not_asserted():
+    estimate = breakfast().estimate()
+    floating = tuple(msgspec.structs.replace(item, contradicted=item.name == "cup") for item in estimate.objects)
+    graph = builder().on_scene_estimate(msgspec.structs.replace(estimate, objects=floating))
+    assert "cup" not in {item.name for item in graph.objects}
+    assert "clear(bowl)" in asserted(graph)
+
+
+def test_the_surface_that_was_seen_is_passed_on():
+    surface = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]])
+    estimate = msgspec.structs.replace(breakfast().estimate(), support=surface)
+    assert builder().on_scene_estimate(estimate).support is surface
+
+
 def test_objects_that_the_catalogue_does_not_hold_are_refused():
     estimate = breakfast().estimate()
     unknown = msgspec.structs.replace(estimate.objects[0], label="teapot")

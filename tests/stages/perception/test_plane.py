@@ -14,9 +14,10 @@ from runner.contract import Refused
 from stages.devices.bop import read_dataset
 from stages.devices.bop_detections import read_detections
 from stages.messages import Candidate, Frame
-from stages.perception.plane import find_plane, height_above
+from stages.perception.plane import find_plane, height_above, support_region
 from stages.perception.poses import inverse, pose
 from stages.perception.preprocessing import preprocess
+from stages.scene import regions
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.scenes import DATA, VIEW, K, camera, render, upright
 
@@ -155,3 +156,30 @@ def test_the_robot_is_not_evidence() -> None:
     )  # fmt: skip
     observed = preprocess(frame, [], np.random.default_rng(0), max_height=0.6)
     assert not observed.depth[mask].any() and not observed.foreground[mask].any()
+
+
+def seen_surface(edge: float, *, stray: int = 0, elsewhere: bool = False) -> np.ndarray:
+    """The surface that is seen of a table that ends at y = ``edge`` of its frame, with objects on it, above a floor."""
+    seen = render(PLACED, noise=0.002).scene
+    T, rng = camera(), np.random.default_rng(0)
+    rays = VIEW.rays()
+    at_plane = rays / np.maximum((rays * T[:3, 2]).sum(-1) / (T[:3, 2] * T[:3, 3]).sum(), 1e-6)[..., None]
+    y = ((at_plane - T[:3, 3]) @ T[:3, :3])[..., 1]
+    gone = (y < edge) & ~((y < edge - 0.15) & elsewhere)
+    depth = np.where(gone, seen.depth * 1.5, seen.depth)
+    rows, columns = np.nonzero(gone)
+    chosen = rng.choice(len(rows), stray, replace=False)
+    depth[rows[chosen], columns[chosen]] = seen.depth[rows[chosen], columns[chosen]]
+    return support_region(depth.astype(np.float32), VIEW, T)
+
+
+@pytest.mark.parametrize(("stray", "elsewhere"), [(0, False), (10, False), (0, True)])
+def test_the_surface_ends_where_the_table_does(stray: int, elsewhere: bool) -> None:
+    """Neither single readings at its height nor another table beyond a gap widen it."""
+    region = seen_surface(-0.05, stray=stray, elsewhere=elsewhere)
+    assert regions.area(region) > 0.1
+    assert region[:, 1].min() == pytest.approx(-0.05, abs=0.008)
+
+
+def test_no_surface_is_seen_where_there_is_no_reading() -> None:
+    assert len(support_region(np.zeros((VIEW.height, VIEW.width), np.float32), VIEW, camera())) == 0

@@ -7,6 +7,7 @@ from stages.messages import SceneEstimate, Verdict
 from stages.messages.scene import UnknownRegion
 from stages.scene.episode import Episode, plain, table
 from stages.scene.text import certainty, support, tree
+from stages.scene.truth import Judgement
 from tests.stages.episodes import scene
 from tests.stages.layouts import Layout
 
@@ -74,7 +75,7 @@ def test_an_episode_that_saw_nothing_still_reads() -> None:
         satisfied=(),
         violated=(),
     )
-    text = plain(Episode(verdict=verdict, looks=(), plans=(), outcomes=()))
+    text = plain(Episode(verdict=verdict, looks=(), plans=(), outcomes=(), judgement=Judgement(claimed=False)))
     for expected in ("NOT restored. perception:", "not perceived", "none was needed", "nothing was moved"):
         assert expected in text
     assert max(map(len, text.splitlines())) <= 100

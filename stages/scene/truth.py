@@ -1,0 +1,165 @@
+"""The goal by the simulator's truth: which of its relations hold, where perception differs, what was lost."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stages.messages import Assertion, Goal, Outcome, SceneGraph, Snapshot, Verdict, VirtualObject
+from stages.messages.scene import SceneObject
+from stages.perception.poses import inverse
+from stages.perception.scoring import label_of
+from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.relations import Tolerances, assertions, supports
+from stages.scene.standing import Stances, standing_of
+from stages.scene.virtual import satisfied
+
+_BELOW = 0.02
+"""Metres below the table's surface from which on an object has left the table."""
+_TIPPED = np.cos(np.deg2rad(30.0))
+"""Cosine of the angle by which an object's upward direction has turned if it was knocked over."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """An object that ended where nobody wanted it."""
+
+    name: str
+    how: Literal["left the table", "was knocked over"]
+    said: bool
+    """Whether the verdict's reason or a failed transfer names it."""
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.how}, {'as was said' if self.said else 'and nobody said so'}"
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What the simulator knows of the end of an episode."""
+
+    claimed: bool
+    """Whether the verdict says that the goal is restored."""
+    held: tuple[Assertion, ...] = ()
+    """Relations of the goal as it was shown that hold at the end."""
+    violated: tuple[Assertion, ...] = ()
+    differences: tuple[str, ...] = ()
+    """Where the verdict says something else, relation by relation."""
+    losses: tuple[Loss, ...] = ()
+
+    @property
+    def restored(self) -> bool:
+        """Whether every relation of the goal holds; never where no goal was taught."""
+        return bool(self.held) and not self.violated
+
+    @property
+    def false_success(self) -> bool:
+        """Whether a success was claimed that is none."""
+        return self.claimed and not self.restored
+
+
+class Truth:
+    """Judges episodes with one catalogue's objects.
+
+    The goal is what was shown: on, in, clear and exist are those of the true poses at the look that taught it. What
+    stands beside what is a matter of a threshold, so the pairs are those that were taught, each where it truly stood.
+    """
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
+
+    def judge(
+        self, snapshots: Sequence[Snapshot], goal: Goal | None, verdict: Verdict, outcomes: Sequence[Outcome]
+    ) -> Judgement:
+        """The end of an episode; ``snapshots`` are those of its looks, in order."""
+        if goal is None:
+            return Judgement(verdict.success)
+        shown = max(k for k, one in enumerate(snapshots) if _shows(one.purpose, goal.name))
+        final = snapshots[-1]
+        wanted = self._wanted(snapshots[shown], goal.scene)
+        held, violated = satisfied(wanted, self._scene(final, goal.scene), self._catalogue)
+        return Judgement(
+            verdict.success, held, violated, _differences(held, violated, verdict),
+            self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes)),
+        )  # fmt: skip
+
+    def _scene(self, snapshot: Snapshot, taught: SceneGraph) -> SceneGraph:
+        """The true scene graph; what left the table does not exist in it."""
+        T_base_table = _table(snapshot, taught)
+        objects = tuple(
+            SceneObject(name=name, label=label_of(name, self._catalogue), T_base_object=T)
+            for name, T in zip(snapshot.names, snapshot.T_base_objects, strict=True)
+            if not _left(T, T_base_table)
+        )
+        found = assertions(supports(standing_of(objects, self._stances, T_base_table), Tolerances()))
+        return msgspec.structs.replace(taught, objects=objects, virtual_objects=(), assertions=found)
+
+    def _wanted(self, shown: Snapshot, taught: SceneGraph) -> SceneGraph:
+        """The goal as it was shown."""
+        scene = self._scene(shown, taught)
+        poses = {item.name: item.T_base_object for item in scene.objects}
+        regions = tuple(
+            _moved(item, poses) for item in taught.virtual_objects if {item.parent, item.child} <= set(poses)
+        )
+        names = {item.name for item in regions}
+        beside = tuple(item for item in taught.assertions if not names.isdisjoint(item.arguments))
+        return msgspec.structs.replace(scene, virtual_objects=regions, assertions=(*scene.assertions, *beside))
+
+    def _losses(self, snapshots: Sequence[Snapshot], taught: SceneGraph, words: set[str]) -> tuple[Loss, ...]:
+        """What left the table, or stands neither as it was shown nor as it stood when the work began."""
+        shown, final = snapshots[0], snapshots[-1]
+        before = (shown, snapshots[min(1, len(snapshots) - 1)])
+        T_base_table = _table(final, taught)
+        found: list[Loss] = []
+        for k, (name, T) in enumerate(zip(final.names, final.T_base_objects, strict=True)):
+            if _left(T, T_base_table):
+                found.append(Loss(name, "left the table", name in words))
+            elif not any(self._alike(name, T, one.T_base_objects[k]) for one in before):
+                found.append(Loss(name, "was knocked over", name in words))
+        return tuple(found)
+
+    def _alike(self, name: str, A: Floats, B: Floats) -> bool:
+        """Whether the same side of an object is up, modulo its symmetries."""
+        turned = B[2, :3] @ self._catalogue[label_of(name, self._catalogue)].symmetries.transforms()[:, :3, :3]
+        return bool((turned @ A[2, :3]).max() > _TIPPED)
+
+
+def _shows(purpose: str, name: str) -> bool:
+    """Whether a look was for a goal, or for the goal of that name."""
+    return purpose.partition(",")[0] in ("goal", f"goal {name}")
+
+
+def _table(snapshot: Snapshot, taught: SceneGraph) -> Floats:
+    """T_base_table, as it was perceived where the recording is older than the field."""
+    return taught.T_base_table if snapshot.T_base_table is None else snapshot.T_base_table
+
+
+def _left(T_base_object: Floats, T_base_table: Floats) -> bool:
+    return bool((inverse(T_base_table) @ T_base_object)[2, 3] < -_BELOW)
+
+
+def _moved(region: VirtualObject, poses: dict[str, Floats]) -> VirtualObject:
+    T_parent_child = inverse(poses[region.parent]) @ poses[region.child]
+    return msgspec.structs.replace(region, T_parent_virtual=T_parent_child)
+
+
+def _differences(held: Sequence[Assertion], violated: Sequence[Assertion], verdict: Verdict) -> tuple[str, ...]:
+    true = dict.fromkeys(held, "holds") | dict.fromkeys(violated, "does not hold")
+    said = dict.fromkeys(verdict.satisfied, "holds") | dict.fromkeys(verdict.violated, "does not hold")
+    none = "is no relation of the goal"
+    return tuple(
+        f"{item} {said.get(item, none)} by perception and {true.get(item, none)} in truth"
+        for item in dict.fromkeys((*true, *said))
+        if true.get(item) != said.get(item)
+    )
+
+
+def _words(verdict: Verdict, outcomes: Sequence[Outcome]) -> set[str]:
+    """The words in which failures were told."""
+    failed = [f"{item.object} {item.reason}" for item in outcomes if not item.success]
+    return set(re.findall(r"\w+", " ".join([verdict.reason, *failed])))

@@ -1,0 +1,118 @@
+"""The end of an episode by the simulator's truth."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.messages import Goal, Outcome, Snapshot, Verdict
+from stages.scene.truth import Judgement, Truth
+from stages.scene.virtual import satisfied
+from tests.stages.episodes import outcome, transfer
+from tests.stages.layouts import T_BASE_TABLE, Layout, catalogue
+
+SHOWN = Layout().put("tray", 0.1, 0.2).put("cup", 0.0, 0.0, on="tray").put("sugar_box", 0.0, -0.2).put(
+    "soup_can", 0.0, -0.3
+)  # fmt: skip
+START = Layout().put("tray", 0.1, 0.2).put("cup", 0.2, -0.1).put("sugar_box", 0.0, -0.2).put("soup_can", 0.0, -0.3)
+TRUTH = Truth(catalogue())
+
+
+def snapshot(layout: Layout, purpose: str) -> Snapshot:
+    return Snapshot(
+        names=tuple(layout.poses),
+        T_base_objects=np.stack([T_BASE_TABLE @ T for T in layout.poses.values()]),
+        joint_names=(),
+        joint_positions=np.zeros(0),
+        time=1.0,
+        purpose=purpose,
+        T_base_table=T_BASE_TABLE,
+    )
+
+
+def with_pose(layout: Layout, name: str, T: np.ndarray) -> Layout:
+    return Layout({**layout.poses, name: T})
+
+
+def verdict(taught: Layout, perceived: Layout, reason: str = "") -> Verdict:
+    held, violated = satisfied(taught.graph(), perceived.graph(), catalogue())
+    return Verdict(
+        goal_name="tea", success=not violated, failed_stage="executor" if violated else "", reason=reason,
+        satisfied=held, violated=violated,
+    )  # fmt: skip
+
+
+def judged(
+    final: Layout, said: Verdict, *, taught: Layout = SHOWN, shown: Layout = SHOWN, outcomes: tuple[Outcome, ...] = ()
+) -> Judgement:
+    snapshots = [
+        snapshot(shown, "goal"),
+        snapshot(shown, "goal, look 2"),
+        snapshot(START, "start"),
+        snapshot(final, "after transfer 1"),
+    ]
+    return TRUTH.judge(snapshots, Goal(name="tea", scene=taught.graph(), pddl=""), said, outcomes)
+
+
+def test_a_scene_restored_as_claimed() -> None:
+    found = judged(SHOWN.disturbed(np.random.default_rng(0), metres=0.002, degrees=1), verdict(SHOWN, SHOWN))
+    assert found.restored and found.claimed and not found.false_success
+    assert found.differences == () and found.losses == ()
+    assert "in(cup, tray)" in map(str, found.held) and "in(soup_can_near_sugar_box, soup_can)" in map(str, found.held)
+
+
+def test_a_success_that_the_truth_denies_is_a_false_one() -> None:
+    found = judged(START, verdict(SHOWN, SHOWN))
+    assert found.false_success
+    assert "in(cup, tray) holds by perception and does not hold in truth" in found.differences
+
+
+def test_a_failure_that_the_truth_denies_is_no_success_but_said() -> None:
+    found = judged(SHOWN, verdict(SHOWN, START))
+    assert found.restored and not found.claimed and not found.false_success
+    assert "in(cup, tray) does not hold by perception and holds in truth" in found.differences
+
+
+def test_what_was_taught_wrongly_is_judged_by_what_was_shown() -> None:
+    found = judged(START, verdict(START, START), taught=START)
+    assert found.false_success
+    assert "in(cup, tray) is no relation of the goal by perception and does not hold in truth" in found.differences
+    assert "on(cup, table) holds by perception and is no relation of the goal in truth" in found.differences
+
+
+def test_a_neighbour_must_stand_where_it_truly_stood() -> None:
+    shown = with_pose(SHOWN, "soup_can", Layout().put("soup_can", 0.0, -0.36).poses["soup_can"])
+    assert list(map(str, judged(SHOWN, verdict(SHOWN, SHOWN), shown=shown).violated)) == [
+        "in(soup_can_near_sugar_box, soup_can)"
+    ]
+
+
+def test_what_lies_on_the_floor_is_lost_and_does_not_exist() -> None:
+    floor = Layout().put("cup", -0.3, 0.0).poses["cup"].copy()
+    floor[2, 3] -= 0.7
+    found = judged(with_pose(START, "cup", floor), verdict(SHOWN, START, "gave up"))
+    assert [str(loss) for loss in found.losses] == ["cup left the table, and nobody said so"]
+    assert "exist(cup)" in map(str, found.violated)
+    said = judged(with_pose(START, "cup", floor), verdict(SHOWN, START, "not seen: cup (3 looks)"))
+    assert [loss.said for loss in said.losses] == [True]
+
+
+def test_what_lies_though_it_stood_was_knocked_over_and_a_failed_transfer_may_say_so() -> None:
+    lying = Layout().put("sugar_box", 0.0, -0.2, resting=1).poses["sugar_box"]
+    final = with_pose(SHOWN, "sugar_box", lying)
+    assert [str(loss) for loss in judged(final, verdict(SHOWN, SHOWN)).losses] == [
+        "sugar_box was knocked over, and nobody said so"
+    ]
+    slipped = outcome(1, transfer("sugar_box", "table", "tray"), failed_stage="grasp", reason="it slipped")
+    assert [loss.said for loss in judged(final, verdict(SHOWN, SHOWN), outcomes=(slipped,)).losses] == [True]
+
+
+def test_what_lies_as_it_was_shown_was_not_knocked_over() -> None:
+    lying = Layout().put("sugar_box", 0.0, -0.2, resting=1).poses["sugar_box"]
+    shown = with_pose(SHOWN, "sugar_box", lying)
+    turned = lying.copy()
+    turned[:3, :3] = Rotation.from_rotvec([0, 0, 1.0]).as_matrix() @ lying[:3, :3]
+    assert judged(with_pose(shown, "sugar_box", turned), verdict(shown, shown), shown=shown, taught=shown).losses == ()
+
+
+def test_without_a_goal_nothing_was_restored() -> None:
+    found = TRUTH.judge([snapshot(START, "goal")], None, verdict(SHOWN, START), ())
+    assert not found.restored and not found.false_success
