@@ -70,6 +70,10 @@ def test_settings_limit_boxes_and_labels(image: np.ndarray) -> None:
     assert {candidate.label for candidate in message.candidates} <= {"cup", "tray"}
 
 
+def test_an_unknown_number_of_objects_expects_none(image: np.ndarray) -> None:
+    assert len(candidates(image, expected="auto").candidates) == len(candidates(image).candidates)
+
+
 def test_objects_known_to_be_there_are_doubted_rather_than_missed(image: np.ndarray) -> None:
     sure = candidates(image).candidates
     assert len(candidates(image, expected=len(sure)).candidates) == len(sure)
