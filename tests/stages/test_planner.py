@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -270,6 +271,15 @@ def test_without_room_within_reach_the_task_is_refused():
     start = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box").put("tuna_can", 0.1, 0.2)
     found = cramped.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()))
     assert found.reason == "no room on the table for soup_can within reach"
+
+
+@pytest.mark.parametrize("unknown", ["goal", "current"])
+def test_a_scene_of_a_camera_that_does_not_know_where_it_is_is_no_place_to_move_in(unknown: str):
+    scenes = {"goal": breakfast().graph(), "current": START.graph()}
+    scenes[unknown] = msgspec.structs.replace(scenes[unknown], T_base_camera=None, name="photo")
+    found = planner().on_task(Task(goal_name="goal", **scenes))
+    assert found.status == "refused" and not found.transfers
+    assert "scene 'photo'" in found.reason and "camera's pose" in found.reason
 
 
 def test_settings_are_checked():
