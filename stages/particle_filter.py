@@ -106,6 +106,7 @@ class ParticleFilter(Stage):
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
+            lambda_r=self.config.lambda_r,
         )
 
     def _reached(self, scene: ObservedScene, hypothesis: Hypothesis, charged: float) -> float:

@@ -58,7 +58,8 @@ class Refiner(Stage):
         placed = [Placed(item.label, item.T_camera_object) for item in scene_estimate.objects]
         refined = self._refiner.refine(scene, observation.rgb, placed)
         doubted = tuple(map(judged, scene_estimate.objects, refined.objects))
-        doubt = self._judge.assess(scene, doubted, scene_estimate.log_weights, scene_estimate.winner)
+        log_weights = scene_estimate.log_weights / scene_estimate.lambda_r
+        doubt = self._judge.assess(scene, doubted, log_weights, scene_estimate.winner)
         objects = tuple(map(_object, scene_estimate.objects, refined.objects))
         return annotated(msgspec.structs.replace(scene_estimate, objects=objects), doubt)
 

@@ -115,6 +115,8 @@ class Posterior(Part, frozen=True, kw_only=True):
     """Combinations of the frame that the cap left out."""
     dropped: bool = False
     """The hypothesis cannot win: ``log_weight`` is an upper bound, the objects stand where they start."""
+    lambda_r: float = 1.0
+    """Scale of the weight: ``log_weight`` is minus this times the cost, metres times pixels."""
 
 
 class SceneEstimate(Message, frozen=True, kw_only=True):
@@ -134,3 +136,5 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """Of each hypothesis, summing to 1: ``log_weights`` after calibration; None where they were not judged."""
     unknown: tuple[UnknownRegion, ...] = ()
     """What no object explains, the largest first."""
+    lambda_r: float = 1.0
+    """Scale of the weights: each of ``log_weights`` is minus this times a cost, metres times pixels."""

@@ -212,6 +212,42 @@ def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
     assert (estimate.scene_id, estimate.image_id, estimate.name) == (3, 7, "scene")
 
 
+def seen_from_a_known_camera(*xs: float) -> tuple[list[Posterior], Observation]:
+    """Cups along the robot's x axis, the most confident first."""
+    cups = tuple(
+        ObjectPose(
+            name=name, label="cup", T_camera_object=pose(np.eye(3), np.array([x, 0.0, 1.0])), confidence=0.5, cost=0.0,
+            box=np.zeros(4),
+        )
+        for name, x in zip(("cup", "cup_2"), xs, strict=True)
+    )  # fmt: skip
+    observation = Observation(
+        depth=np.ones((2, 2), np.float32), rgb=np.zeros((2, 2, 3), np.uint8), foreground=np.ones((2, 2), bool), K=K,
+        T_camera_table=np.eye(4), T_base_camera=np.eye(4),
+    )  # fmt: skip
+    return [Posterior(index=0, count=1, objects=cups, log_weight=-1.0)], observation
+
+
+def test_equal_objects_keep_their_names_from_look_to_look_by_where_they_stand() -> None:
+    ranker = Ranker(Ranker.Config())
+    first, swapped, moved = (
+        ranker.on_posteriors(*seen_from_a_known_camera(*xs), Recorded())
+        for xs in ((0.0, 0.3), (0.301, 0.002), (0.7, 0.0))
+    )
+    assert [item.name for item in first.objects] == ["cup", "cup_2"]
+    assert [item.name for item in swapped.objects] == ["cup_2", "cup"]
+    assert [item.name for item in moved.objects] == ["cup_2", "cup"]
+
+
+def test_looks_of_a_camera_that_does_not_know_where_it_is_have_nothing_to_do_with_each_other() -> None:
+    ranker = Ranker(Ranker.Config())
+    for xs in ((0.0, 0.3), (0.3, 0.0)):
+        posteriors, observation = seen_from_a_known_camera(*xs)
+        unknown = msgspec.structs.replace(observation, T_base_camera=None)
+        estimate = ranker.on_posteriors(posteriors, unknown, Recorded())
+        assert [item.name for item in estimate.objects] == ["cup", "cup_2"]
+
+
 def estimate_of(poses: dict[str, np.ndarray]) -> SceneEstimate:
     items = tuple(
         ObjectPose(name=label, label=label, T_camera_object=T, confidence=0.5, cost=0.0, box=np.zeros(4))
