@@ -12,6 +12,7 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.messages import Candidate, Candidates, Frame
+from stages.perception.duplicates import distinct
 from stages.scene.catalogue import Catalogue, Floats
 
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
@@ -70,7 +71,9 @@ class Detector(Stage):
         config = self._config
         found = self._detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
         sure = int((found.scores >= config.threshold).sum())
-        kept = slice(sure if config.expected == "auto" or sure >= config.expected else None)
+        # A second box of one object, or one of its part, is no other object.
+        objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], found.boxes))
+        kept = slice(sure if config.expected == "auto" or objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message

@@ -18,6 +18,7 @@ from stages.perception.combinations import (
     ordered,
 )
 from stages.perception.composition import FirstLook, charge
+from stages.perception.duplicates import distinct
 from stages.perception.preprocessing import preprocess
 
 OBJECT_COST = 0.1
@@ -74,7 +75,17 @@ class Hypotheses(Stage):
         if len(starts) < len(candidates) or not candidates:
             yield from self._most_confident(candidates, number, ctx)
         else:
-            yield from self._cheapest(candidates, starts, glimpses, number, ctx)
+            kept = self._distinct(candidates, starts, ctx)
+            chosen, starts, glimpses = ([each[i] for i in kept] for each in (candidates, starts, glimpses))
+            yield from self._cheapest(chosen, starts, glimpses, number, ctx)
+
+    def _distinct(self, candidates: list[Candidate], starts: list[Start], ctx: Context) -> list[int]:
+        """The candidates that show no object which a more confident one shows."""
+        labels, boxes = [item.label for item in candidates], [item.box for item in candidates]
+        kept = distinct(labels, boxes, [start.T_camera_object[:3, 3] for start in starts])
+        if len(kept) < len(candidates):
+            ctx.log(f"{len(candidates) - len(kept)} of {len(candidates)} candidates show an object once more: left out")
+        return kept
 
     def _most_confident(self, candidates: list[Candidate], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
         if number is None and candidates:

@@ -10,6 +10,7 @@ import numpy as np
 
 from runner.contract import Context, Stage
 from stages.messages import ObjectPose, Observation, Posterior, SceneEstimate
+from stages.perception.duplicates import is_same_scene, without_doubles
 from stages.scene.naming import Named, names_kept, unique_names
 
 
@@ -34,8 +35,9 @@ class Ranker(Stage):
         log_weights = np.array([posterior.log_weight for posterior in posteriors], float)
         winner = int(np.argmax(log_weights))
         best = posteriors[winner]
+        scenes = [without_doubles(posterior.objects) for posterior in posteriors]
         return SceneEstimate(
-            objects=self._named(best.objects, observation),
+            objects=self._named(scenes[winner], observation),
             winner=winner,
             log_weights=log_weights,
             left_out=best.left_out,
@@ -46,6 +48,7 @@ class Ranker(Stage):
             image_id=observation.image_id,
             name=observation.name,
             lambda_r=best.lambda_r,
+            repeated=_repeated(scenes, np.argsort(-log_weights, kind="stable").tolist()),
         )
 
     def _named(self, objects: Sequence[ObjectPose], observation: Observation) -> tuple[ObjectPose, ...]:
@@ -58,3 +61,12 @@ class Ranker(Stage):
         names = unique_names(labels, names_kept(labels, places, self._known))
         self._known = {**self._known, **dict(zip(names, map(Named, labels, places), strict=True))}
         return tuple(msgspec.structs.replace(item, name=name) for item, name in zip(objects, names, strict=True))
+
+
+def _repeated(scenes: Sequence[Sequence[ObjectPose]], order: Sequence[int]) -> tuple[int, ...]:
+    """Those that are the same as one before them in the order."""
+    new: list[int] = []
+    for i in order:
+        if not any(is_same_scene(scenes[k], scenes[i]) for k in new):
+            new.append(i)
+    return tuple(sorted(set(order) - set(new)))

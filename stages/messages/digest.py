@@ -138,3 +138,5 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """What no object explains, the largest first."""
     lambda_r: float = 1.0
     """Scale of the weights: each of ``log_weights`` is minus this times a cost, metres times pixels."""
+    repeated: tuple[int, ...] = ()
+    """Hypotheses that end in the same scene as a heavier one: they have no share in ``probabilities``."""

@@ -173,11 +173,28 @@ def test_the_number_of_objects_is_found(seen: Rendered, filter_stage: ParticleFi
     found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), *false)
     config = Hypotheses.Config(n_objects="auto", finalists=4)
     (observation, *hypotheses), ctx = enumerate_(config, frame(seen), found, filter_stage)
-    assert [h.left_out for h in hypotheses] == [12] * 4
-    assert "4 of 16 hypotheses, 12 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[0]
+    assert [h.left_out for h in hypotheses] == [4] * 4
+    assert "1 of 4 candidates show an object once more: left out" in ctx.lines[0]
+    assert "4 of 8 hypotheses, 4 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[1]
     posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
     estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
     assert sorted(item.label for item in estimate.objects) == ["mug", "tea_box"]
+
+
+def part_of(box: np.ndarray) -> np.ndarray:
+    """A box about the upper two thirds."""
+    return np.array([box[0] - 2, box[1], box[2] + 2, box[1] + (box[3] - box[1]) * 0.66])
+
+
+def test_an_object_that_is_detected_twice_takes_nobodys_place(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    twice = candidates(
+        ("mug", seen.boxes["mug"], 0.9), ("mug", part_of(seen.boxes["mug"]), 0.8),
+        ("tea_box", seen.boxes["tea_box"], 0.5),
+    )  # fmt: skip
+    for number in (2, 3):
+        (_, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=number), frame(seen), twice, filter_stage)
+        assert [sorted(c.label for c in h.candidates) for h in hypotheses] == [["mug", "tea_box"]]
+    assert "1 of 3 candidates show an object once more: left out" in ctx.lines[0]
 
 
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
@@ -210,6 +227,14 @@ def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
     estimate = Ranker(Ranker.Config()).on_posteriors([posterior(*p) for p in enumerate(weights)], observation, ctx)
     assert estimate.winner == 1 and estimate.log_weights.tolist() == list(weights)
     assert (estimate.scene_id, estimate.image_id, estimate.name) == (3, 7, "scene")
+
+
+def test_a_scene_that_is_found_twice_is_one_scene(seen: Rendered) -> None:
+    (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
+    scenes = [estimate_of({label: seen.poses[label]}).objects for label in ("mug", "tea_box", "mug")]
+    posteriors = [msgspec.structs.replace(posterior(i, w), objects=scenes[i]) for i, w in enumerate((-2.0, -3.0, -1.5))]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert (estimate.winner, estimate.repeated) == (2, (0,))
 
 
 def seen_from_a_known_camera(*xs: float) -> tuple[list[Posterior], Observation]:

@@ -9,7 +9,8 @@ import pytest
 from runner.contract import Context, Refused
 from stages.estimate import Box, EstimatedScene, estimate_scene
 from stages.messages import Candidate, Candidates, Frame
-from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, render, upright
+from stages.perception.poses import inverse
+from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright
 
 PLACED = {"mug": upright("mug", -0.05, 0.0, 0.6), "tea_box": upright("tea_box", 0.1, 0.06, 0.2)}
 RGB = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
@@ -69,7 +70,7 @@ class One:
 def test_a_detector_gives_boxes(seen: Rendered) -> None:
     depth = seen.scene.depth.astype(np.float64)
     found = estimate_scene(
-        RGB, depth, K, CATALOGUE_FILE, detector=One(seen.boxes["mug"]), dof=3, T_base_camera=np.eye(4)
+        RGB, depth, K, CATALOGUE_FILE, detector=One(seen.boxes["mug"]), dof=3, T_base_camera=inverse(camera())
     )
     assert [item.name for item in found.objects] == ["mug"]
     assert found.graph.frame == "base"
