@@ -1,5 +1,6 @@
 """Perception as a library call."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -74,6 +75,15 @@ def test_a_detector_gives_boxes(seen: Rendered) -> None:
     )
     assert [item.name for item in found.objects] == ["mug"]
     assert found.graph.frame == "base"
+
+
+def test_the_lines_of_the_readme_run(seen: Rendered, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (lines,) = [code for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "estimate_scene" in code]
+    lines = lines.replace('"DIR/models"', "catalogue")
+    given = {"rgb": RGB, "depth": seen.scene.depth, "K": K, "catalogue": CATALOGUE_FILE, "boxes": boxes(seen, "mug")}
+    exec(lines, given)
+    assert "mug" in capsys.readouterr().out
 
 
 def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
