@@ -72,7 +72,7 @@ class Detector(Stage):
         found = self._detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
         sure = int((found.scores >= config.threshold).sum())
         # A second box of one object, or one of its part, is no other object.
-        objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], found.boxes))
+        objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
         kept = slice(sure if config.expected == "auto" or objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
