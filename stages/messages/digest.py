@@ -61,6 +61,9 @@ class Start(Struct, frozen=True, kw_only=True):
 
     T_camera_object: Pose
     trace: ParticleTrace
+    rise: float = 0.03
+    """Metres by which what it shows stands out of the plane, on average, along the ray and bounded; asked for where N_c
+    is not known."""
 
 
 class Glimpse(Struct, frozen=True, kw_only=True):
@@ -88,6 +91,8 @@ class Placed(Struct, frozen=True, kw_only=True):
 
     candidate: Candidate
     T_camera_object: Pose
+    rise: float = 0.03
+    """As its start has it."""
 
 
 class Hypothesis(Part, frozen=True, kw_only=True):
@@ -101,7 +106,8 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     incumbent: tuple[Placed, ...] = ()
     """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
     object_cost: float = 0.0
-    """Every object adds this share of what readings all over its box would cost; 0 where N_c is known."""
+    """Every object adds this share of what readings all over its box would cost, as far as it rises from the plane; 0
+    where N_c is known."""
 
 
 class Posterior(Part, frozen=True, kw_only=True):

@@ -197,6 +197,17 @@ def test_an_object_that_is_detected_twice_takes_nobodys_place(seen: Rendered, fi
     assert "1 of 3 candidates show an object once more: left out" in ctx.lines[0]
 
 
+def test_what_lies_flat_is_found_too(filter_stage: ParticleFilter) -> None:
+    laden = render({"tray": upright("tray", 0.0, 0.0, 0.3), "tea_box": upright("tea_box", 0.02, 0.0, 0.2)})
+    loose = laden.boxes["tray"] + np.array([-30.0, -20.0, 30.0, 20.0])
+    found = candidates(("tray", loose, 0.9), ("tea_box", laden.boxes["tea_box"], 0.9))
+    config = Hypotheses.Config(n_objects="auto")
+    (observation, *hypotheses), ctx = enumerate_(config, frame(laden), found, filter_stage)
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert sorted(item.label for item in estimate.objects) == ["tea_box", "tray"]
+
+
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))
