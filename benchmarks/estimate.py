@@ -14,11 +14,12 @@ from typing import Any, Literal
 from benchmarks.accuracy import failures, right_sets, score, table
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, ImageId, detections_file, images, parse_wanted
-from benchmarks.common.pipeline import Done, Estimate, Pipeline, Step, Steps
+from benchmarks.common.pipeline import Done, Estimate, Part, Pipeline, answered, constructed_filter
 from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph
 from runner.process.children import ENVIRONMENT
 from stages.devices.bop_results import HEADER, Result
+from stages.particle_filter import ParticleFilter
 from stages.scene.catalogue import Catalogue
 
 _GRAPH = Path(__file__).parents[1] / "graphs" / "bop.yaml"
@@ -62,7 +63,6 @@ def estimates(dataset: Path, chosen: Iterable[Image], settings: Settings) -> Ite
     if settings.processes == 1:
         pipeline = Pipeline(graph)
         yield from map(pipeline.estimate, chosen)
-        pipeline.close()
         return
     with _Workers(graph, settings.processes, whole=settings.share == "images") as workers:
         if settings.share == "images":
@@ -113,9 +113,9 @@ class _Workers:
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def submit(self, step: Step, index: int) -> Future[Done]:
-        """Executes a step in the next free process."""
-        return self._pool.submit(_run_step, step, index)
+    def submit(self, part: Part) -> Future[Done[Any]]:
+        """Has the particle filter of the next free process answer."""
+        return self._pool.submit(_run_part, part)
 
     def estimates(self, chosen: Iterable[Image]) -> Iterator[Estimate]:
         """Whole images, in order."""
@@ -127,7 +127,7 @@ class _Mine:
     """What a worker process has constructed."""
 
     pipeline: Pipeline
-    steps: Steps
+    particle_filter: ParticleFilter
 
 
 def _begin(graph_json: str, whole: bool) -> None:
@@ -135,7 +135,7 @@ def _begin(graph_json: str, whole: bool) -> None:
     if whole:
         _Mine.pipeline = Pipeline(graph)
     else:
-        _Mine.steps = Steps(graph, [node.name for node in graph.nodes.values() if node.replicated])
+        _Mine.particle_filter = constructed_filter(graph)
 
 
 def _ready() -> None:
@@ -146,8 +146,8 @@ def _run_image(image: Image) -> Estimate:
     return _Mine.pipeline.estimate(image)
 
 
-def _run_step(step: Step, index: int) -> Done:
-    return _Mine.steps.timed(step, index)
+def _run_part(part: Part) -> Done[Any]:
+    return answered(_Mine.particle_filter, part)
 
 
 def results(estimate: Estimate, catalogue: Catalogue) -> list[Result]:

@@ -23,11 +23,11 @@ from benchmarks.accuracy import Score, score
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, Truth, detections_file, images
 from benchmarks.estimate import Settings, estimates
-from runner.contract import Level
 from stages.camera import SimulatedCamera
 from stages.devices import fetch
 from stages.devices.bop_results import Result
 from stages.devices.tabletop import TABLE
+from stages.estimate import Quiet
 from stages.messages import Candidate, Candidates, ObjectPose, Observation, SceneEstimate, Snapshot
 from stages.perception.likelihood import ObservedScene
 from stages.perception.poses import exp_so3, inverse, pose
@@ -190,7 +190,7 @@ def _look(
         joint_positions=np.array(list(fetch.HOME.values())),
         time=0.0,
     )
-    frame = camera.on_snapshot(snapshot, _Silent(np.random.default_rng([8, index])))
+    frame = camera.on_snapshot(snapshot, Quiet([8, index]))
     frame = msgspec.structs.replace(
         frame, n_objects=len(labels), scene_id=index + 1, index=index, name=f"look {index + 1}"
     )
@@ -210,18 +210,6 @@ def _boxes(items: Sequence[tuple[CatalogueObject, Floats]], view: View) -> list[
     nearest = np.maximum.reduce(layers)
     shown = [np.nonzero((layer > 0) & (layer >= nearest)) for layer in layers]
     return [np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float) for v, u in shown]
-
-
-@dataclass(frozen=True)
-class _Silent:
-    """A context for a stage that is called from here."""
-
-    rng: np.random.Generator
-    directory: Path = Path()
-    time_ns: int = 0
-
-    def log(self, text: str, *, level: Level = "info") -> None:
-        """Nobody listens."""
 
 
 # --- table and figure -------------------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.messages import Frame, LookRequest, Snapshot
 from stages.perception.depth_noise import color_noise, structured_light
-from stages.scene.catalogue import Catalogue
+from stages.perception.poses import is_pose
+from stages.scene.catalogue import Catalogue, Floats
 
 
 class SimulatedCamera(Stage):
@@ -148,27 +149,32 @@ class RealSenseCamera(Stage):
         height: int = 480
         fps: int = 30
         serial: str = ""
+        T_base_camera: tuple[float, ...] = ()
+        """Where the colour camera (x right, y down, z forward) stands in the robot's base frame: 4 x 4 row by row,
+        metres. Without it scenes have their poses in the table's frame, and nothing is planned in them."""
 
         def __post_init__(self) -> None:
             for name in ("width", "height", "fps"):
                 if getattr(self, name) < 1:
                     raise Refused(f"camera.{name} = {getattr(self, name)}: must be at least 1")
+            _camera_pose(self.T_base_camera)
 
     def __init__(self, config: Config) -> None:
         from stages.devices.realsense import RealSense
 
+        self._T_base_camera = _camera_pose(config.T_base_camera)
         self._camera = RealSense(width=config.width, height=config.height, fps=config.fps, serial=config.serial)
         self._looks = 0
 
     def on_look_request(self, look_request: LookRequest, ctx: Context) -> Frame:
-        """The image; the camera does not know where it is."""
+        """The image, from where the settings say that the camera is."""
         rgb, depth = self._camera.read()
         self._looks += 1
         return Frame(
             rgb=rgb,
             depth=depth,
             K=self._camera.K,
-            T_base_camera=None,
+            T_base_camera=self._T_base_camera,
             robot_mask=None,
             name=look_request.purpose,
             index=self._looks - 1,
@@ -178,3 +184,19 @@ class RealSenseCamera(Stage):
     def close(self) -> None:
         """Stops streaming."""
         self._camera.close()
+
+
+def _camera_pose(numbers: tuple[float, ...]) -> Floats | None:
+    """The setting as a 4 x 4 matrix; None where there is none.
+
+    Raises:
+        Refused: it is no pose.
+    """
+    if not numbers:
+        return None
+    if len(numbers) != 16:
+        raise Refused(f"camera.T_base_camera has {len(numbers)} numbers; a pose is 16, row by row")
+    T = np.reshape(numbers, (4, 4))
+    if not is_pose(T):
+        raise Refused(f"camera.T_base_camera: {T.tolist()} is no pose; a rotation and metres above 0 0 0 1 are")
+    return T

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -101,8 +102,8 @@ class Demonstrator(Stage):
         """Shows a goal, disturbs it and restores it; else only what is called happens."""
         goal_name: str = "breakfast"
         """Of the script."""
-        n_objects: int = 0
-        """Objects that the goal scene must show; 0 accepts any number."""
+        n_objects: int | Literal["auto"] = "auto"
+        """Objects that the goal scene must show; ``auto`` (as 0) accepts any number."""
         repeats: int = 2
         """Further looks at a scene in which objects are missing or for which there is no plan."""
         tries: int = 2
@@ -113,8 +114,9 @@ class Demonstrator(Stage):
 
         def __post_init__(self) -> None:
             """Refuses limits that are not counts and names that are no file names."""
+            if self.n_objects != "auto" and self.n_objects < 0:
+                raise Refused(f"demonstrator.n_objects={self.n_objects}: must be 0 or more, or auto")
             for name, least in (
-                ("n_objects", 0),
                 ("repeats", 0),
                 ("tries", 1),
                 ("max_replans", 0),
@@ -234,8 +236,8 @@ class Demonstrator(Stage):
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""
         if self._state.goal is None:
-            few = len(scene.objects) < self._config.n_objects
-            return f"{len(scene.objects)} of {self._config.n_objects} objects seen" if few else ""
+            wanted = 0 if self._config.n_objects == "auto" else self._config.n_objects
+            return f"{len(scene.objects)} of {wanted} objects seen" if len(scene.objects) < wanted else ""
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 

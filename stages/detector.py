@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.messages import Candidate, Candidates, Frame
+from stages.perception.duplicates import distinct
 from stages.scene.catalogue import Catalogue, Floats
 
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
@@ -25,9 +27,9 @@ class Detector(Stage):
 
         weights: Path = _WEIGHTS
         threshold: float = 0.3
-        expected: int = 0
-        """Objects known to be there: where fewer reach the threshold, what reaches ``floor`` is kept as well, since
-        an object that is mostly hidden is better doubted than missed."""
+        expected: int | Literal["auto"] = "auto"
+        """Objects known to be there, ``auto`` (as 0) where nobody knows: where fewer reach the threshold, what reaches
+        ``floor`` is kept as well, since an object that is mostly hidden is better doubted than missed."""
         floor: float = 0.05
         max_boxes: int = 12
         labels: tuple[str, ...] = ()
@@ -38,8 +40,8 @@ class Detector(Stage):
                 raise Refused(f"detector.threshold = {self.threshold}: must lie between 0 and 1")
             if not 0 < self.floor <= self.threshold:
                 raise Refused(f"detector.floor = {self.floor}: must lie above 0 and up to threshold = {self.threshold}")
-            if self.expected < 0:
-                raise Refused(f"detector.expected = {self.expected}: must be 0 or more")
+            if self.expected != "auto" and self.expected < 0:
+                raise Refused(f"detector.expected = {self.expected}: must be 0 or more, or auto")
             if self.max_boxes < 1:
                 raise Refused(f"detector.max_boxes = {self.max_boxes}: must be at least 1")
 
@@ -69,7 +71,9 @@ class Detector(Stage):
         config = self._config
         found = self._detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
         sure = int((found.scores >= config.threshold).sum())
-        kept = slice(sure if sure >= config.expected else None)
+        # A second box of one object, or one of its part, is no other object.
+        objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
+        kept = slice(sure if config.expected == "auto" or objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message

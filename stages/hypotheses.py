@@ -18,11 +18,13 @@ from stages.perception.combinations import (
     ordered,
 )
 from stages.perception.composition import FirstLook, charge
+from stages.perception.duplicates import distinct
 from stages.perception.preprocessing import preprocess
 
 OBJECT_COST = 0.1
-"""With N_c unknown an object must explain a tenth of what readings all over its box would cost: what is there explains
-a fifth at least, even where its box is loose; what is not there, or there already, next to nothing."""
+"""With N_c unknown an object must explain a tenth of what readings all over its box would cost, as far above the plane
+as it rises: what is there explains a fifth at least, even where its box is loose; what is not there, or there already,
+next to nothing."""
 
 
 class Hypotheses(Stage):
@@ -74,7 +76,17 @@ class Hypotheses(Stage):
         if len(starts) < len(candidates) or not candidates:
             yield from self._most_confident(candidates, number, ctx)
         else:
-            yield from self._cheapest(candidates, starts, glimpses, number, ctx)
+            kept = self._distinct(candidates, starts, ctx)
+            chosen, starts, glimpses = ([each[i] for i in kept] for each in (candidates, starts, glimpses))
+            yield from self._cheapest(chosen, starts, glimpses, number, ctx)
+
+    def _distinct(self, candidates: list[Candidate], starts: list[Start], ctx: Context) -> list[int]:
+        """The candidates that show no object which a more confident one shows."""
+        labels, boxes = [item.label for item in candidates], [item.box for item in candidates]
+        kept = distinct(labels, boxes, [start.T_camera_object[:3, 3] for start in starts])
+        if len(kept) < len(candidates):
+            ctx.log(f"{len(candidates) - len(kept)} of {len(candidates)} candidates show an object once more: left out")
+        return kept
 
     def _most_confident(self, candidates: list[Candidate], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
         if number is None and candidates:
@@ -94,7 +106,8 @@ class Hypotheses(Stage):
         ctx: Context,
     ) -> Iterator[Hypothesis]:  # fmt: skip
         object_cost = 0.0 if number is not None else OBJECT_COST
-        look = FirstLook(glimpses, [charge([candidate.box], object_cost) for candidate in candidates])
+        charges = [charge([c.box], [start.rise], object_cost) for c, start in zip(candidates, starts, strict=True)]
+        look = FirstLook(glimpses, charges)
         h = count_subsets(len(candidates), number)
         ranked = cheapest(look.cost, len(candidates), number, h)
         combinations = (ranked if number is not None else additions_first(ranked))[: self.config.finalists]
@@ -102,7 +115,8 @@ class Hypotheses(Stage):
         if left_out:
             ctx.log(_left_out(len(combinations), left_out, "dearest at first look", "finalists"))
         incumbent = tuple(
-            Placed(candidate=candidates[i], T_camera_object=starts[i].T_camera_object) for i in combinations[0]
+            Placed(candidate=candidates[i], T_camera_object=starts[i].T_camera_object, rise=starts[i].rise)
+            for i in combinations[0]
         )
         for index, chosen in enumerate(combinations):
             yield Hypothesis(

@@ -84,6 +84,8 @@ class ParticleFilter(Stage):
         scene, suspect = _scene(view), _suspect(candidate)
         track = self._filter.look(scene, suspect, among=prospect.count)
         start = Start(T_camera_object=_pose(track), trace=_trace(track))
+        if prospect.n_objects is None:
+            start = msgspec.structs.replace(start, rise=self._filter.rise(scene, suspect, track))
         return msgspec.structs.replace(nothing, start=start, glimpse=self._filter.glimpse(scene, suspect, track))
 
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
@@ -91,7 +93,9 @@ class ParticleFilter(Stage):
         scene = _scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
-        charged = charge([suspect.box for suspect in suspects], hypothesis.object_cost)
+        rises = [start.rise for start in hypothesis.starts]
+        # Without first looks N_c is known, and nothing is charged.
+        charged = charge([s.box for s in suspects], rises, hypothesis.object_cost) if hypothesis.object_cost else 0.0
         reached = self._reached(scene, hypothesis, charged)
         result = self._filter.estimate(scene, suspects, starts, reached=reached)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
@@ -106,6 +110,7 @@ class ParticleFilter(Stage):
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
+            lambda_r=self.config.lambda_r,
         )
 
     def _reached(self, scene: ObservedScene, hypothesis: Hypothesis, charged: float) -> float:
@@ -113,9 +118,10 @@ class ParticleFilter(Stage):
         if not hypothesis.starts:
             return np.inf
         suspects = [_suspect(placed.candidate) for placed in hypothesis.incumbent]
+        rises = [placed.rise for placed in hypothesis.incumbent]
         poses = [placed.T_camera_object[:3] for placed in hypothesis.incumbent]
         # For the incumbent itself the charges cancel exactly.
-        difference = charge([suspect.box for suspect in suspects], hypothesis.object_cost) - charged
+        difference = charge([suspect.box for suspect in suspects], rises, hypothesis.object_cost) - charged
         return self._filter.begun_cost(scene, suspects, poses) + difference
 
 

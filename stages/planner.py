@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from runner.contract import Refused, Stage
-from stages.messages import Assertion, Plan, Task, Transfer
+from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning import search
 from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
@@ -81,6 +81,9 @@ class Planner(Stage):
 
     def on_task(self, task: Task) -> Plan:
         """A plan whose every transfer has poses, or a refusal before anything moves."""
+        for scene in (task.goal, task.current):
+            if scene.frame != "base":
+                return _answer("refused", "", reason=_nowhere(scene))
         missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
         if missing:
             return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
@@ -205,6 +208,13 @@ def _answer(
         domain_pddl=DOMAIN,
         problem_pddl=problem,
         expanded=expanded,
+    )
+
+
+def _nowhere(scene: SceneGraph) -> str:
+    return (
+        f"scene '{scene.name}' has its poses in the table's frame, for the camera's pose in the robot's base frame is "
+        "not known; the camera must say it (T_base_camera)"
     )
 
 

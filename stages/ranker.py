@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from runner.contract import Context, Stage
-from stages.messages import Observation, Posterior, SceneEstimate
+from stages.messages import ObjectPose, Observation, Posterior, SceneEstimate
+from stages.perception.duplicates import is_same_scene, without_doubles
+from stages.scene.naming import Named, names_kept, unique_names
 
 
 class Ranker(Stage):
-    """Ranks hypotheses by the unnormalised weight of their best particle (paper, section IV-A.3)."""
+    """Ranks hypotheses by the unnormalised weight of their best particle (paper, section IV-A.3).
+
+    Equal objects keep their names from look to look by where they stand, if it is known where the camera is.
+    """
+
+    stateful = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
@@ -19,14 +28,16 @@ class Ranker(Stage):
 
     def __init__(self, config: Config) -> None:
         self.config = config
+        self._known: dict[str, Named] = {}
 
     def on_posteriors(self, posteriors: list[Posterior], observation: Observation, ctx: Context) -> SceneEstimate:
         """The scene of greatest weight; of equals, the one of the more confident hypothesis (lower index)."""
         log_weights = np.array([posterior.log_weight for posterior in posteriors], float)
         winner = int(np.argmax(log_weights))
         best = posteriors[winner]
+        scenes = [without_doubles(posterior.objects) for posterior in posteriors]
         return SceneEstimate(
-            objects=best.objects,
+            objects=self._named(scenes[winner], observation),
             winner=winner,
             log_weights=log_weights,
             left_out=best.left_out,
@@ -37,4 +48,26 @@ class Ranker(Stage):
             image_id=observation.image_id,
             name=observation.name,
             support=observation.support,
+            lambda_r=best.lambda_r,
+            repeated=_repeated(scenes, np.argsort(-log_weights, kind="stable").tolist()),
         )
+
+    def _named(self, objects: Sequence[ObjectPose], observation: Observation) -> tuple[ObjectPose, ...]:
+        """The objects with the names of those that stood where they stand; looks without a common frame share none."""
+        if observation.T_base_camera is None:
+            return tuple(objects)
+        labels = [item.label for item in objects]
+        T_base_objects = [observation.T_base_camera @ item.T_camera_object for item in objects]
+        places = np.reshape(T_base_objects, (-1, 4, 4))[:, :3, 3]
+        names = unique_names(labels, names_kept(labels, places, self._known))
+        self._known = {**self._known, **dict(zip(names, map(Named, labels, places), strict=True))}
+        return tuple(msgspec.structs.replace(item, name=name) for item, name in zip(objects, names, strict=True))
+
+
+def _repeated(scenes: Sequence[Sequence[ObjectPose]], order: Sequence[int]) -> tuple[int, ...]:
+    """Those that are the same as one before them in the order."""
+    new: list[int] = []
+    for i in order:
+        if not any(is_same_scene(scenes[k], scenes[i]) for k in new):
+            new.append(i)
+    return tuple(sorted(set(order) - set(new)))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
@@ -58,7 +59,9 @@ class Refiner(Stage):
         placed = [Placed(item.label, item.T_camera_object) for item in scene_estimate.objects]
         refined = self._refiner.refine(scene, observation.rgb, placed)
         doubted = tuple(map(judged, scene_estimate.objects, refined.objects))
-        doubt = self._judge.assess(scene, doubted, scene_estimate.log_weights, scene_estimate.winner)
+        log_weights = scene_estimate.log_weights / scene_estimate.lambda_r
+        log_weights[list(scene_estimate.repeated)] = -np.inf
+        doubt = self._judge.assess(scene, doubted, log_weights, scene_estimate.winner)
         objects = tuple(map(_object, scene_estimate.objects, refined.objects))
         return annotated(msgspec.structs.replace(scene_estimate, objects=objects), doubt)
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from runner.contract import Level, Refused
+from runner.contract import Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
+from stages.estimate import Quiet
 from stages.messages import Candidate, Candidates, Frame
 from stages.messages.arrays import Depth, Intrinsics, Rgb
 from stages.perception.poses import pose
@@ -84,12 +85,12 @@ def images(dataset: Path, detections: Path, wanted: Iterable[ImageId] | int | No
     boxes = RecordedDetections(RecordedDetections.Config(detections=detections, catalogue=dataset / "models"))
     truths = truths_by_image(dataset)
     ids = None if wanted is None or isinstance(wanted, int) else _known(wanted, truths)
-    for frame in camera.source(_Silent()):
+    for frame in camera.source(Quiet()):
         id = frame.scene_id, frame.image_id
         if isinstance(wanted, int) and frame.index >= wanted:
             return
         if ids is None or id in ids:
-            yield Image(frame, boxes.on_frame(frame, _Silent()), truths.get(id, ()))
+            yield Image(frame, boxes.on_frame(frame, Quiet()), truths.get(id, ()))
 
 
 def detections_file(dataset: Path, name: str) -> Path:
@@ -152,17 +153,3 @@ def _scene_truth(file: Path) -> Iterator[Truth]:
             T = pose(np.array(item["cam_R_m2c"], float).reshape(3, 3), np.array(item["cam_t_m2c"], float) / 1000)
             visible = float(info.get("visib_fract", 1.0))
             yield Truth((int(file.parent.name), int(image)), int(item["obj_id"]), T, visible)
-
-
-class _Silent:
-    """A step's context outside a graph: recorded boxes and images need neither random numbers nor a log."""
-
-    time_ns = 0
-    directory = Path()
-
-    @property
-    def rng(self) -> np.random.Generator:
-        return np.random.default_rng(0)
-
-    def log(self, text: str, *, level: Level = "info") -> None:
-        """Says nothing."""

@@ -1,30 +1,25 @@
-"""Runs the perception stages of a graph in one process, with the ids, seeds and bytes that its runner would give."""
+"""Runs the perception stages of a graph in one process, with the seeds and bytes that its runner would give."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from benchmarks.common.datasets import Image
-from runner.contract import Level, Message, Refused
+from runner.contract import Message, Refused
 from runner.graph.graph import Graph
-from runner.graph.ports import Handler
-from runner.message import codec
-from runner.message.codec import Envelope
-from runner.message.ids import MessageId
-from runner.process.inbox import Inbox
-from runner.process.step import Arrival, Executor, receive, step_time
-from stages.messages import SceneEstimate
+from runner.process.step import step_seed
+from stages.estimate import FiltersHere, Quiet, SceneEstimator
+from stages.messages import Hypothesis, Observation, Posterior, SceneEstimate
+from stages.messages.digest import Prospect, Sighting
+from stages.particle_filter import ParticleFilter
 
-_GIVEN = ("camera", "detector")
-"""Stages whose messages come with the image."""
-_SINK = ("scene_graph", "scene_estimate")
-"""The consumer of the final scene, and its port."""
+STAGES = ("hypotheses", "particle_filter", "ranker", "refiner")
+"""Of a graph: those between the candidates and the final scene."""
+Answer = TypeVar("Answer", Sighting, Posterior)
 
 
 @dataclass(frozen=True)
@@ -41,159 +36,88 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Step:
-    """One call of a handler."""
+class Part:
+    """What one particle filter is asked."""
 
-    stage: str
-    handler: Handler
-    arrivals: tuple[Arrival, ...]
+    handler: Literal["on_prospect", "on_hypothesis"]
+    message: Prospect | Hypothesis
+    observation: Observation
 
 
 @dataclass(frozen=True)
-class Done:
-    """What a step emitted, and the time it took its process."""
+class Done(Generic[Answer]):
+    """Its answer, and the time that it took its process."""
 
-    stage: str
-    envelopes: tuple[Envelope, ...]
+    answer: Answer
     cpu_seconds: float
 
 
 class Pool(Protocol):
-    """Processes that execute steps of replicated stages."""
+    """Processes with a particle filter each."""
 
-    def submit(self, step: Step, index: int) -> Future[Done]:
-        """Starts a step of image ``index`` somewhere else."""
+    def submit(self, part: Part) -> Future[Done[Any]]:
+        """Has the next free one answer."""
         ...
+
+
+@dataclass
+class PooledFilters:
+    """Particle filters in other processes."""
+
+    pool: Pool
+    cpu_seconds: float = field(default=0.0, init=False)
+    """What they have computed so far."""
+
+    def look(self, prospects: Sequence[Prospect], observation: Observation) -> list[Sighting]:
+        """All looks at once."""
+        return self._answers([Part("on_prospect", prospect, observation) for prospect in prospects])
+
+    def estimate(self, hypotheses: Sequence[Hypothesis], observation: Observation) -> list[Posterior]:
+        """All hypotheses at once."""
+        return self._answers([Part("on_hypothesis", hypothesis, observation) for hypothesis in hypotheses])
+
+    def _answers(self, parts: Sequence[Part]) -> list[Any]:
+        done = [future.result() for future in [self.pool.submit(part) for part in parts]]
+        self.cpu_seconds += sum(each.cpu_seconds for each in done)
+        return [each.answer for each in done]
+
+
+def answered(stage: ParticleFilter, part: Part) -> Done[Any]:
+    """What a particle filter makes of its part."""
+    cpu = time.process_time()
+    answer = getattr(stage, part.handler)(part.message, part.observation, Quiet())
+    return Done(answer, time.process_time() - cpu)
 
 
 class Pipeline:
     """The stages between boxes and the final scene, constructed once."""
 
     def __init__(self, graph: Graph, pool: Pool | None = None) -> None:
-        self._graph = graph
-        self._names = between(graph)
-        local = [name for name in self._names if pool is None or not graph.nodes[name].replicated]
-        self._steps = Steps(graph, local)
-        self._pool = pool
+        """Raises Refused where the graph lacks one of the stages."""
+        for name in STAGES:
+            if name not in graph.nodes:
+                raise Refused(f"{graph.name}: no stage '{name}'; there are {', '.join(graph.nodes)}")
+        self._seed = graph.seed
+        made: dict[str, Any] = {name: graph.nodes[name].construct() for name in STAGES if name != "particle_filter"}
+        self._pooled = None if pool is None else PooledFilters(pool)
+        filters = self._pooled or FiltersHere(constructed_filter(graph))
+        self._estimator = SceneEstimator(made["hypotheses"], filters, made["ranker"], made["refiner"])
 
     def estimate(self, image: Image) -> Estimate:
-        """The scene of one image; ids are those of a run over the whole data set."""
-        began, cpu = time.perf_counter(), time.process_time()
-        look = _Look(self._graph, self._names, image)
-        running: set[Future[Done]] = set()
-        elsewhere = 0.0
-        while (step := look.next()) or running:
-            if step is None:
-                finished, running = wait(running, return_when=FIRST_COMPLETED)
-                for done in (future.result() for future in finished):
-                    elsewhere += done.cpu_seconds
-                    look.deliver(done.stage, done.envelopes)
-            elif self._pool is not None and self._graph.nodes[step.stage].replicated:
-                running.add(self._pool.submit(step, image.frame.index))
-            else:
-                for envelope in self._steps.run(step, image.frame.index):
-                    look.deliver(step.stage, (envelope,))
-        seconds = time.perf_counter() - began
-        return Estimate(look.final(), tuple(look.messages), time.process_time() - cpu + elsewhere, seconds)
+        """The scene of one image; random numbers are those of a run over the whole data set."""
+        began, cpu = time.perf_counter(), self._cpu_seconds()
+        # Of all steps only the one that answers the frame asks for random numbers.
+        ctx = Quiet(step_seed(self._seed, "hypotheses", f"camera.frame#{image.frame.index}"))
+        messages = tuple(self._estimator.messages(image.frame, image.candidates, ctx))
+        final = messages[-1]
+        assert isinstance(final, SceneEstimate)
+        return Estimate(final, messages, self._cpu_seconds() - cpu, time.perf_counter() - began)
 
-    def close(self) -> None:
-        """Releases what the stages hold."""
-        self._steps.close()
+    def _cpu_seconds(self) -> float:
+        return time.process_time() + (self._pooled.cpu_seconds if self._pooled else 0.0)
 
 
-class Steps:
-    """Constructed stages and how to call their handlers."""
-
-    def __init__(self, graph: Graph, names: Sequence[str]) -> None:
-        self._graph = graph
-        self._stages = {name: graph.nodes[name].construct() for name in names}
-
-    def run(self, step: Step, index: int) -> Iterator[Envelope]:
-        """Yields what the handler emits, numbered as for the image ``index`` of a run over the whole data set."""
-        node = self._graph.nodes[step.stage]
-        executor = Executor(
-            node,
-            self._stages[step.stage],
-            seed=self._graph.seed,
-            directory=Path(),
-            log=_silent,
-            numbers=dict.fromkeys(node.type.outputs, index),
-        )
-        yield from executor.run(step.handler, step.arrivals, step_time(node, step.arrivals, 0))
-
-    def timed(self, step: Step, index: int) -> Done:
-        """Everything the handler emits, and its CPU time."""
-        cpu = time.process_time()
-        envelopes = tuple(self.run(step, index))
-        return Done(step.stage, envelopes, time.process_time() - cpu)
-
-    def close(self) -> None:
-        """Releases what the stages hold."""
-        for stage in self._stages.values():
-            stage.close()
-
-
-class _Look:
-    """The messages of one image on their way."""
-
-    def __init__(self, graph: Graph, names: Sequence[str], image: Image) -> None:
-        self._graph = graph
-        self._inboxes = {name: Inbox(graph.nodes[name]) for name in names}
-        self._steps: deque[Step] = deque()
-        self._final: list[Message] = []
-        self.messages: list[Message] = []
-        for stage, port, message in (
-            ("camera", "frame", image.frame),
-            ("detector", "candidates", image.candidates),
-        ):
-            root = f"camera.frame#{image.frame.index}"
-            id = f"{stage}.{port}#{image.frame.index}"
-            self.deliver(stage, (codec.envelope(message, id=id, lineage=root, time_ns=0, causes=()),))
-
-    def deliver(self, stage: str, envelopes: Sequence[Envelope]) -> None:
-        """Hands messages to every stage that consumes them."""
-        for envelope in envelopes:
-            port = MessageId.of(envelope.id).port
-            kind = self._graph.nodes[stage].type.outputs[port]
-            if stage not in _GIVEN:
-                self.messages.append(codec.open_envelope(kind, envelope))
-            for route in self._graph.routes(stage):
-                if route.output == port:
-                    self._add(route.consumer, route.input, envelope)
-
-    def _add(self, consumer: str, port: str, envelope: Envelope) -> None:
-        if (consumer, port) == _SINK:
-            self._final.append(codec.open_envelope(SceneEstimate, envelope))
-        if consumer in self._inboxes:
-            inbox = self._inboxes[consumer]
-            inbox.add(receive(self._graph.nodes[consumer].type.inputs[port], envelope))
-            while (ready := inbox.pop()) is not None:
-                self._steps.append(Step(consumer, ready.handler, ready.arrivals))
-
-    def next(self) -> Step | None:
-        """The next step that can run now."""
-        return self._steps.popleft() if self._steps else None
-
-    def final(self) -> SceneEstimate:
-        """The scene; there is one for every image unless a stage swallows it."""
-        (scene,) = self._final
-        assert isinstance(scene, SceneEstimate)
-        return scene
-
-
-def between(graph: Graph) -> list[str]:
-    """The stages that the final scene depends on, in the graph's order, without those whose messages are given."""
-    if _SINK[0] not in graph.nodes:
-        raise Refused(f"{graph.name}: no stage '{_SINK[0]}'; its {_SINK[1]} is what is scored")
-    wanted: set[str] = set()
-    waiting = [graph.nodes[_SINK[0]].inputs[_SINK[1]].stage]
-    while waiting:
-        name = waiting.pop()
-        if name not in wanted and name not in _GIVEN:
-            wanted.add(name)
-            waiting += [edge.stage for edge in graph.nodes[name].inputs.values()]
-    return [name for name in graph.nodes if name in wanted]
-
-
-def _silent(text: str, level: Level) -> None:
-    """What stages say is for a run's terminal."""
+def constructed_filter(graph: Graph) -> ParticleFilter:
+    """The graph's particle filter."""
+    stage: Any = graph.nodes["particle_filter"].construct()
+    return stage

@@ -70,10 +70,11 @@ def _parsed(path: Path, number: int, row: dict[str, str]) -> Result:
 
 
 def write_scene_graph(path: Path, graph: SceneGraph) -> None:
-    """Writes assertions as text and poses as numbers, JSON."""
+    """Writes assertions as text and poses as numbers, JSON; ``frame`` says what the poses are relative to."""
     content = {
         "scene_id": graph.scene_id,
         "im_id": graph.image_id,
+        "frame": graph.frame,
         "assertions": [str(assertion) for assertion in graph.assertions],
         "objects": {item.name: item.T_base_object.tolist() for item in graph.objects},
         "virtual_objects": {

@@ -63,6 +63,9 @@ class Start(Struct, frozen=True, kw_only=True):
 
     T_camera_object: Pose
     trace: ParticleTrace
+    rise: float = 0.03
+    """Metres by which what it shows stands out of the plane, on average, along the ray and bounded; asked for where N_c
+    is not known."""
 
 
 class Glimpse(Struct, frozen=True, kw_only=True):
@@ -90,6 +93,8 @@ class Placed(Struct, frozen=True, kw_only=True):
 
     candidate: Candidate
     T_camera_object: Pose
+    rise: float = 0.03
+    """As its start has it."""
 
 
 class Hypothesis(Part, frozen=True, kw_only=True):
@@ -103,7 +108,8 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     incumbent: tuple[Placed, ...] = ()
     """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
     object_cost: float = 0.0
-    """Every object adds this share of what readings all over its box would cost; 0 where N_c is known."""
+    """Every object adds this share of what readings all over its box would cost, as far as it rises from the plane; 0
+    where N_c is known."""
 
 
 class Posterior(Part, frozen=True, kw_only=True):
@@ -117,6 +123,8 @@ class Posterior(Part, frozen=True, kw_only=True):
     """Combinations of the frame that the cap left out."""
     dropped: bool = False
     """The hypothesis cannot win: ``log_weight`` is an upper bound, the objects stand where they start."""
+    lambda_r: float = 1.0
+    """Scale of the weight: ``log_weight`` is minus this times the cost, metres times pixels."""
 
 
 class SceneEstimate(Message, frozen=True, kw_only=True):
@@ -138,3 +146,7 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """What no object explains, the largest first."""
     support: Matrix | None = None
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
+    lambda_r: float = 1.0
+    """Scale of the weights: each of ``log_weights`` is minus this times a cost, metres times pixels."""
+    repeated: tuple[int, ...] = ()
+    """Hypotheses that end in the same scene as a heavier one: they have no share in ``probabilities``."""

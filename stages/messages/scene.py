@@ -80,15 +80,20 @@ class Assertion(Struct, frozen=True, kw_only=True):
 
 
 class SceneObject(Struct, frozen=True, kw_only=True):
-    """An object of a scene graph and its pose in the robot's base frame (the table's where there is no robot)."""
+    """An object of a scene graph and its pose."""
 
     name: str
     label: str
     T_base_object: Pose
+    """In the scene's :attr:`SceneGraph.frame`."""
 
 
 class SceneGraph(Message, frozen=True, kw_only=True):
-    """s_t: everything asserted of one scene."""
+    """s_t: everything asserted of one scene.
+
+    Poses are in the robot's base frame. Where nobody knows how the camera stands to it they are in the table's frame,
+    whose x and y axes are arbitrary: good for relations, not for a robot.
+    """
 
     objects: tuple[SceneObject, ...]
     virtual_objects: tuple[VirtualObject, ...]
@@ -96,9 +101,15 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     T_base_table: Pose
     """The support plane: its z axis is up and its origin lies on the surface."""
     T_base_camera: Pose | None
+    """None where it is not known."""
     K: Intrinsics
     name: str = ""
     scene_id: int = 0
     image_id: int = 0
     support: Matrix | None = None
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
+
+    @property
+    def frame(self) -> Literal["base", "table"]:
+        """What the poses are relative to."""
+        return "table" if self.T_base_camera is None else "base"

@@ -88,15 +88,28 @@ def pixel_costs(
     return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
 
 
-def charge(boxes: Sequence[Floats], share: float) -> float:
-    """What objects cost by being there, metres times pixels: ``share`` of what their boxes would, were nothing in them
-    explained.
+def charge(boxes: Sequence[Floats], rises: Sequence[float], share: float) -> float:
+    """What objects cost by being there, metres times pixels: ``share`` of what their boxes would, were they filled with
+    readings as far from the plane as the objects rise (metres) and nothing explained.
 
     A box frames what is visible of its object, so the object can explain most of it. One that explains less than its
     share is not worth having: a double of another, or one that is not there.
     """
     areas = [float(box[2] - box[0]) * float(box[3] - box[1]) for box in boxes]
-    return share * CostForm().truncation * sum(areas)
+    return share * sum(area * rise for area, rise in zip(areas, rises, strict=True))
+
+
+def rise(scene: ObservedScene, layer: Float32s, form: CostForm) -> float:
+    """Metres by which an object (H x W inverse depth) stands out of the plane along the rays, bounded, on average.
+
+    What lies flat, as a tray does, cannot explain more of its box than this.
+    """
+    shown = (layer > scene.plane_inverse) & (scene.factor > 0)
+    if not shown.any():
+        return form.truncation
+    plane = np.where(scene.plane_inverse > 0, scene.plane_inverse, np.float32(1e-6))[shown]
+    out = scene.factor[shown] * (1.0 / plane - 1.0 / layer[shown])
+    return float(np.minimum(out, form.truncation).mean(dtype=np.float64))
 
 
 def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:

@@ -78,6 +78,16 @@ def pose(R: Floats, t: Floats) -> Floats:
     return T
 
 
+def is_rotation(R: Floats) -> bool:
+    """Whether a 3 x 3 matrix turns things and does nothing else to them."""
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0)
+
+
+def is_pose(T: Floats) -> bool:
+    """Whether a 4 x 4 matrix is a rotation and a translation."""
+    return is_rotation(T[:3, :3]) and bool(np.isfinite(T).all()) and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
+
+
 def inverse(T: Floats) -> Floats:
     """Inverse of a 4 x 4 rigid transform."""
     return pose(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.messages.digest import Glimpse
-from stages.perception.composition import Composition, fit, glimpse, scene_cost
+from stages.perception.composition import Composition, fit, glimpse, rise, scene_cost
 from stages.perception.likelihood import ObservedScene, with_object
 from stages.perception.particle_filter import FilterSettings, ObjectFilter, Task, Track, pixels, run_together
 from stages.perception.rasteriser import Float32s, inverse_depth
@@ -116,6 +116,10 @@ class SceneFilter:
     def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Glimpse:
         """What a track would show, for the first ranking of combinations."""
         return glimpse(scene, self._layer(scene, suspect, track.T_camera_object), suspect.box, self._settings.cost)
+
+    def rise(self, scene: ObservedScene, suspect: Suspect, track: Track) -> float:
+        """How far a track's object stands out of the plane, metres."""
+        return rise(scene, self._layer(scene, suspect, track.T_camera_object), self._settings.cost)
 
     def estimate(
         self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Track] | None = None, *,

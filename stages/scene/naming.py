@@ -2,15 +2,55 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from stages.scene.catalogue import Floats
+
+_STAYED = 0.1
+"""Metres within which an object that nobody took is found again: what touches a neighbour may push it a little."""
 
 
-def unique_names(labels: Sequence[str]) -> list[str]:
-    """The label for the first of its kind, then ``label_2``, ``label_3``, ... in order."""
-    seen: Counter[str] = Counter()
-    names: list[str] = []
-    for label in labels:
-        seen[label] += 1
-        names.append(label if seen[label] == 1 else f"{label}_{seen[label]}")
+@dataclass(frozen=True)
+class Named:
+    """Where an object was when it was last seen."""
+
+    label: str
+    place: Floats
+    """x, y, z in a frame that stays, metres."""
+
+
+def unique_names(labels: Sequence[str], kept: Sequence[str | None] = ()) -> list[str]:
+    """The label for the first of its kind, then ``label_2``, ``label_3``, ... in order.
+
+    ``kept`` are the names of those that have one already, None for others. A name that is another object's label is
+    passed over.
+    """
+    names = [*kept] or [None] * len(labels)
+    taken = {name for name in names if name is not None}
+    result: list[str] = []
+    for label, name in zip(labels, names, strict=True):
+        further = (f"{label}_{number}" for number in count(2))
+        chosen = name or (label if label not in taken else next(n for n in further if n not in taken.union(labels)))
+        taken.add(chosen)
+        result.append(chosen)
+    return result
+
+
+def names_kept(labels: Sequence[str], places: Floats, known: Mapping[str, Named]) -> list[str | None]:
+    """For every object the name of the one of its label that stood where it stands (N x 3), None where none did."""
+    names: list[str | None] = [None] * len(labels)
+    for label in dict.fromkeys(labels):
+        mine = [i for i, other in enumerate(labels) if other == label]
+        theirs = [name for name, item in known.items() if item.label == label]
+        before = np.array([known[name].place for name in theirs]).reshape(-1, 3)
+        # All that is farther away counts alike, so that the one that was moved does not pull at those that stayed.
+        apart = np.minimum(np.linalg.norm(places[mine][:, None] - before, axis=2), _STAYED)
+        for row, column in zip(*linear_sum_assignment(apart), strict=True):
+            if apart[row, column] < _STAYED:
+                names[mine[row]] = theirs[column]
     return names

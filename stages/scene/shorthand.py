@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.perception.poses import is_pose, is_rotation
 from stages.scene.catalogue import Floats, Grasp, Mesh, Primitive, Symmetries
 from stages.scene.geometry import axis_rotation, resting_rotations, transform, turned_up, width_between
 from stages.scene.sections import Section, is_number
@@ -54,8 +55,7 @@ def _discrete_one(section: Section, key: str, item: Any, scale: float) -> Floats
     if not isinstance(rows, list) or len(rows) != 16 or not all(map(is_number, rows)):
         section.refuse("a symmetry is 16 numbers (4 x 4, row by row) or {axis: z, degrees: 180}", key)
     T = np.array(rows, np.float64).reshape(4, 4)
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0 or not np.allclose(T[3], [0, 0, 0, 1]):
+    if not is_pose(T):
         section.refuse("a symmetry is a rotation and a translation; this 4 x 4 matrix is not", key)
     T[:3, 3] *= scale
     return T
@@ -106,7 +106,7 @@ def _resting_one(section: Section, item: Any) -> Floats:
         return RESTING[item]
     if isinstance(item, list) and len(item) == 9 and all(map(is_number, item)):
         R = np.array(item, np.float64).reshape(3, 3)
-        if np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0:
+        if is_rotation(R):
             return R
     return section.refuse(f"{item!r} is neither one of {', '.join(RESTING)} nor a 3 x 3 rotation", "resting")
 

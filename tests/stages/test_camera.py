@@ -101,6 +101,10 @@ def test_realsense_without_its_library_says_what_to_install() -> None:
 def test_realsense_settings_are_checked() -> None:
     with pytest.raises(Refused, match=r"camera\.fps = 0: must be at least 1"):
         RealSenseCamera.Config(fps=0)
+    with pytest.raises(Refused, match=r"camera\.T_base_camera has 3 numbers; a pose is 16, row by row"):
+        RealSenseCamera.Config(T_base_camera=(1.0, 0.0, 0.0))
+    with pytest.raises(Refused, match=r"camera\.T_base_camera: .* is no pose"):
+        RealSenseCamera.Config(T_base_camera=(2.0, *np.eye(4).ravel()[1:].tolist()))
 
 
 def record(folder: Path, frames: list[Frame]) -> Path:

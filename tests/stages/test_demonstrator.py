@@ -103,6 +103,13 @@ class Episode:
         return request
 
 
+def test_any_number_of_objects_is_accepted_where_it_is_to_be_found() -> None:
+    episode = Episode(n_objects="auto")
+    episode.until_task()
+    with pytest.raises(Refused, match=r"demonstrator\.n_objects=-1: must be 0 or more, or auto"):
+        Episode(n_objects=-1)
+
+
 def the_verdict(messages: list[Message]) -> Verdict:
     (verdict,) = messages
     assert isinstance(verdict, Verdict)

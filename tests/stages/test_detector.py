@@ -16,7 +16,7 @@ from stages.detector import Detector, RecordedDetections
 from stages.devices.detector_data import examples
 from stages.messages import Candidates, Frame
 from stages.perception.detection_evaluation import evaluate
-from stages.perception.detection_network import DetectionNetwork
+from stages.perception.detection_network import DetectionNetwork, Detections
 from stages.scene.catalogue import Catalogue
 
 ROOT = Path(__file__).parents[2]
@@ -68,6 +68,19 @@ def test_settings_limit_boxes_and_labels(image: np.ndarray) -> None:
     message = candidates(image, labels=("cup", "tray"))
     assert message.labels == ("cup", "tray")
     assert {candidate.label for candidate in message.candidates} <= {"cup", "tray"}
+
+
+def test_an_unknown_number_of_objects_expects_none(image: np.ndarray) -> None:
+    assert len(candidates(image, expected="auto").candidates) == len(candidates(image).candidates)
+
+
+def test_a_second_box_of_an_object_is_not_one_of_those_expected() -> None:
+    stage = Detector(Detector.Config(expected=2, labels=("cup", "salt_shaker")))
+    boxes = np.array([[100.0, 100, 160, 200], [98, 100, 162, 140], [300, 100, 330, 160]])
+    confidences = np.array([[0.9, 0.0], [0.5, 0.0], [0.0, 0.1]])
+    stage._detect = lambda *_, **__: Detections(boxes, confidences)
+    (message,) = run_stage(stage, [frame(np.zeros((240, 320, 3), np.uint8))])
+    assert [candidate.label for candidate in message.candidates] == ["cup", "cup", "salt_shaker"]
 
 
 def test_objects_known_to_be_there_are_doubted_rather_than_missed(image: np.ndarray) -> None:

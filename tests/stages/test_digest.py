@@ -173,11 +173,39 @@ def test_the_number_of_objects_is_found(seen: Rendered, filter_stage: ParticleFi
     found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), *false)
     config = Hypotheses.Config(n_objects="auto", finalists=4)
     (observation, *hypotheses), ctx = enumerate_(config, frame(seen), found, filter_stage)
-    assert [h.left_out for h in hypotheses] == [12] * 4
-    assert "4 of 16 hypotheses, 12 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[0]
+    assert [h.left_out for h in hypotheses] == [4] * 4
+    assert "1 of 4 candidates show an object once more: left out" in ctx.lines[0]
+    assert "4 of 8 hypotheses, 4 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[1]
     posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
     estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
     assert sorted(item.label for item in estimate.objects) == ["mug", "tea_box"]
+
+
+def part_of(box: np.ndarray) -> np.ndarray:
+    """A box about the upper two thirds."""
+    return np.array([box[0] - 2, box[1], box[2] + 2, box[1] + (box[3] - box[1]) * 0.66])
+
+
+def test_an_object_that_is_detected_twice_takes_nobodys_place(seen: Rendered, filter_stage: ParticleFilter) -> None:
+    twice = candidates(
+        ("mug", seen.boxes["mug"], 0.9), ("mug", part_of(seen.boxes["mug"]), 0.8),
+        ("tea_box", seen.boxes["tea_box"], 0.5),
+    )  # fmt: skip
+    for number in (2, 3):
+        (_, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=number), frame(seen), twice, filter_stage)
+        assert [sorted(c.label for c in h.candidates) for h in hypotheses] == [["mug", "tea_box"]]
+    assert "1 of 3 candidates show an object once more: left out" in ctx.lines[0]
+
+
+def test_what_lies_flat_is_found_too(filter_stage: ParticleFilter) -> None:
+    laden = render({"tray": upright("tray", 0.0, 0.0, 0.3), "tea_box": upright("tea_box", 0.02, 0.0, 0.2)})
+    loose = laden.boxes["tray"] + np.array([-30.0, -20.0, 30.0, 20.0])
+    found = candidates(("tray", loose, 0.9), ("tea_box", laden.boxes["tea_box"], 0.9))
+    config = Hypotheses.Config(n_objects="auto")
+    (observation, *hypotheses), ctx = enumerate_(config, frame(laden), found, filter_stage)
+    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert sorted(item.label for item in estimate.objects) == ["tea_box", "tray"]
 
 
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
@@ -210,6 +238,50 @@ def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
     estimate = Ranker(Ranker.Config()).on_posteriors([posterior(*p) for p in enumerate(weights)], observation, ctx)
     assert estimate.winner == 1 and estimate.log_weights.tolist() == list(weights)
     assert (estimate.scene_id, estimate.image_id, estimate.name) == (3, 7, "scene")
+
+
+def test_a_scene_that_is_found_twice_is_one_scene(seen: Rendered) -> None:
+    (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
+    scenes = [estimate_of({label: seen.poses[label]}).objects for label in ("mug", "tea_box", "mug")]
+    posteriors = [msgspec.structs.replace(posterior(i, w), objects=scenes[i]) for i, w in enumerate((-2.0, -3.0, -1.5))]
+    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    assert (estimate.winner, estimate.repeated) == (2, (0,))
+
+
+def seen_from_a_known_camera(*xs: float) -> tuple[list[Posterior], Observation]:
+    """Cups along the robot's x axis, the most confident first."""
+    cups = tuple(
+        ObjectPose(
+            name=name, label="cup", T_camera_object=pose(np.eye(3), np.array([x, 0.0, 1.0])), confidence=0.5, cost=0.0,
+            box=np.zeros(4),
+        )
+        for name, x in zip(("cup", "cup_2"), xs, strict=True)
+    )  # fmt: skip
+    observation = Observation(
+        depth=np.ones((2, 2), np.float32), rgb=np.zeros((2, 2, 3), np.uint8), foreground=np.ones((2, 2), bool), K=K,
+        T_camera_table=np.eye(4), T_base_camera=np.eye(4),
+    )  # fmt: skip
+    return [Posterior(index=0, count=1, objects=cups, log_weight=-1.0)], observation
+
+
+def test_equal_objects_keep_their_names_from_look_to_look_by_where_they_stand() -> None:
+    ranker = Ranker(Ranker.Config())
+    first, swapped, moved = (
+        ranker.on_posteriors(*seen_from_a_known_camera(*xs), Recorded())
+        for xs in ((0.0, 0.3), (0.301, 0.002), (0.7, 0.0))
+    )
+    assert [item.name for item in first.objects] == ["cup", "cup_2"]
+    assert [item.name for item in swapped.objects] == ["cup_2", "cup"]
+    assert [item.name for item in moved.objects] == ["cup_2", "cup"]
+
+
+def test_looks_of_a_camera_that_does_not_know_where_it_is_have_nothing_to_do_with_each_other() -> None:
+    ranker = Ranker(Ranker.Config())
+    for xs in ((0.0, 0.3), (0.3, 0.0)):
+        posteriors, observation = seen_from_a_known_camera(*xs)
+        unknown = msgspec.structs.replace(observation, T_base_camera=None)
+        estimate = ranker.on_posteriors(posteriors, unknown, Recorded())
+        assert [item.name for item in estimate.objects] == ["cup", "cup_2"]
 
 
 def estimate_of(poses: dict[str, np.ndarray]) -> SceneEstimate:

@@ -288,6 +288,15 @@ def test_without_room_within_reach_the_task_is_refused():
     assert found.reason == "no room on the table for soup_can within reach"
 
 
+@pytest.mark.parametrize("unknown", ["goal", "current"])
+def test_a_scene_of_a_camera_that_does_not_know_where_it_is_is_no_place_to_move_in(unknown: str):
+    scenes = {"goal": breakfast().graph(), "current": START.graph()}
+    scenes[unknown] = msgspec.structs.replace(scenes[unknown], T_base_camera=None, name="photo")
+    found = planner().on_task(Task(goal_name="goal", **scenes))
+    assert found.status == "refused" and not found.transfers
+    assert "scene 'photo'" in found.reason and "camera's pose" in found.reason
+
+
 def test_settings_are_checked():
     with pytest.raises(Refused, match=r"planner.workspace.x=\[1.0, 0.5\]: must be \[lowest, highest\]"):
         Workspace(x=(1.0, 0.5))

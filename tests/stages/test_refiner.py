@@ -67,6 +67,24 @@ def test_the_scene_is_judged(seen: Rendered, stage: Refiner) -> None:
     assert region.points > 300
 
 
+def test_the_scale_of_the_weights_changes_no_probability(seen: Rendered, stage: Refiner) -> None:
+    plain = msgspec.structs.replace(estimate(seen), log_weights=np.array([-2.0, -1.0]))
+    scaled = msgspec.structs.replace(plain, log_weights=np.array([-50.0, -25.0]), lambda_r=25.0)
+    one, other = (stage.on_scene_estimate(each, observation(seen), Recorded()) for each in (plain, scaled))
+    assert one.probabilities == pytest.approx(other.probabilities)
+    assert [item.probability for item in one.objects] == [item.probability for item in other.objects]
+
+
+def test_a_scene_that_is_found_twice_keeps_its_probability(seen: Rendered, stage: Refiner) -> None:
+    twice = msgspec.structs.replace(estimate(seen), log_weights=np.array([-1.0, -1.0]), winner=0)
+    shared, whole = (
+        stage.on_scene_estimate(msgspec.structs.replace(twice, repeated=repeated), observation(seen), Recorded())
+        for repeated in ((), (1,))
+    )
+    assert shared.probabilities == pytest.approx([0.5, 0.5])
+    assert whole.probabilities == pytest.approx([1.0, 0.0])
+
+
 def test_the_plain_form_passes_the_scene_on(seen: Rendered) -> None:
     plain = Refiner(Refiner.Config(catalogue=CATALOGUE_FILE, form="paper"))
     before = estimate(seen)

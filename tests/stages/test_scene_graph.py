@@ -17,11 +17,12 @@ def test_poses_are_in_the_base_frame():
         assert item.T_base_object == pytest.approx(T_BASE_TABLE @ layout.poses[item.name], abs=1e-9)
 
 
-def test_without_a_robot_the_table_frame_is_the_base():
+def test_where_the_camera_is_not_known_poses_are_in_the_tables_frame_and_say_so():
     layout = breakfast()
     estimate = msgspec.structs.replace(layout.estimate(), T_base_camera=None)
     graph = builder().on_scene_estimate(estimate)
     assert graph.T_base_camera is None
+    assert (graph.frame, layout.graph().frame) == ("table", "base")
     assert graph.T_base_table == pytest.approx(np.eye(4))
     assert graph.objects[0].T_base_object == pytest.approx(layout.poses["tray"], abs=1e-9)
     assert asserted(graph) == asserted(layout.graph())

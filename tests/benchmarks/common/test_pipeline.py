@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.common.datasets import images, parse_ids, read_truth, truths_by_image
-from benchmarks.common.pipeline import between
+from benchmarks.common.pipeline import STAGES
 from benchmarks.estimate import Settings, bop_graph, estimate, results
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
@@ -45,7 +45,7 @@ def test_images_are_chosen_by_id_and_keep_their_place() -> None:
 @needs_data
 def test_settings_reach_every_stage_that_has_them() -> None:
     graph = bop_graph(LAYOUT, Settings(dof=3, form="paper", without=("flips",), set=("hypotheses.max_hypotheses=4",)))
-    configs = [graph.nodes[name].config for name in between(graph)]
+    configs = [graph.nodes[name].config for name in STAGES]
     assert {config.dof for config in configs if hasattr(config, "dof")} == {3}
     assert {config.form for config in configs if hasattr(config, "form")} == {"paper"}
     assert graph.nodes["particle_filter"].config.without == ("flips",)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.perception.combinations import cheapest
-from stages.perception.composition import STRIDE, Composition, FirstLook, charge, glimpse, scene_cost
+from stages.perception.composition import STRIDE, Composition, FirstLook, charge, glimpse, rise, scene_cost
 from stages.perception.likelihood import CostForm, Shape
 from stages.perception.poses import random_rotations
 from stages.perception.rasteriser import Float32s, inverse_depth
@@ -98,7 +98,7 @@ def test_an_object_cost_keeps_the_objects_and_drops_their_doubles(seen: Rendered
     layers += [layer(shapes, "tea_box", beside), layer(shapes, "mug", behind)]
     boxes += [boxes[1], boxes[1]]
     glimpses = [glimpse(seen.scene, *each, FORM) for each in zip(layers, boxes, strict=True)]
-    look = FirstLook(glimpses, [charge([box], 0.1) for box in boxes])
+    look = FirstLook(glimpses, [charge([box], [0.03], 0.1) for box in boxes])
     best = cheapest(look.cost, 5, None, 1)[0]
     assert best in {(0, 1, 2), (0, 2, 3)}
 
@@ -109,3 +109,12 @@ def test_an_object_out_of_sight_has_an_empty_glimpse(seen: Rendered, shapes: dic
     found = glimpse(seen.scene, layer(shapes, "mug", away), seen.boxes["mug"], FORM)
     assert found.inverse.size == found.change.size == 0
     assert FirstLook([found]).cost((0,)) == 0.0
+
+
+def test_an_object_rises_from_the_plane_by_what_it_could_explain(shapes: dict[str, Shape]) -> None:
+    placed = {"tray": upright("tray", 0.0, 0.0, 0.0), "tea_box": upright("tea_box", 0.0, 0.0, 0.0)}
+    seen, tray = render(placed), Shape.of(CATALOGUE["tray"].simplified(300))
+    flat = rise(seen.scene, inverse_depth(tray.soup, seen.poses["tray"][:3], VIEW), FORM)
+    high = rise(seen.scene, layer(shapes, "tea_box", seen.poses["tea_box"]), FORM)
+    assert 0.002 < flat < 0.5 * high and 0.8 * FORM.truncation < high < FORM.truncation
+    assert rise(seen.scene, np.zeros_like(seen.scene.depth), FORM) == FORM.truncation

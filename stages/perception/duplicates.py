@@ -1,0 +1,60 @@
+"""Candidates that show one and the same object, and scenes that are one and the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stages.messages.scene import ObjectPose
+from stages.scene.catalogue import Floats
+
+_SHARED = 0.6
+"""Share of the smaller of two boxes that lies in the other if both frame one object, or a part of it."""
+_APART = 0.01
+"""Metres between the origins of two poses of one object; two of its kind can hardly stand nearer to each other."""
+
+
+def distinct(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Floats] | None = None) -> list[int]:
+    """Indices of those that show no object that one before them shows.
+
+    Two show the same object if they have its label, one's box (x0, y0, x1, y1) lies mostly in the other's and, where
+    ``places`` (x, y, z in metres) are known, both stand in one.
+    """
+    kept: list[int] = []
+    for i in range(len(labels)):
+        rivals = (k for k in kept if labels[k] == labels[i] and _shared(boxes[k], boxes[i]) > _SHARED)
+        if not any(places is None or _together(places[k], places[i]) for k in rivals):
+            kept.append(i)
+    return kept
+
+
+def without_doubles(objects: Sequence[ObjectPose]) -> tuple[ObjectPose, ...]:
+    """The objects of a scene, each once."""
+    labels, boxes = [item.label for item in objects], [item.box for item in objects]
+    return tuple(objects[i] for i in distinct(labels, boxes, [_place(item) for item in objects]))
+
+
+def is_same_scene(one: Sequence[ObjectPose], other: Sequence[ObjectPose]) -> bool:
+    """Whether two scenes have the same objects in the same places, whichever candidates they came from."""
+    left = list(other)
+    for item in one:
+        found = next((o for o in left if o.label == item.label and _together(_place(o), _place(item))), None)
+        if found is None:
+            return False
+        left.remove(found)
+    return not left
+
+
+def _shared(a: Floats, b: Floats) -> float:
+    """Share of the smaller box that lies in the other."""
+    inside = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None))
+    return float(inside / max(min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])), 1e-9))
+
+
+def _place(item: ObjectPose) -> Floats:
+    return item.T_camera_object[:3, 3]
+
+
+def _together(a: Floats, b: Floats) -> bool:
+    return bool(np.linalg.norm(a - b) < _APART)

@@ -1,0 +1,40 @@
+"""The graphs that come with the package: settings that hold for all of their stages."""
+
+from pathlib import Path
+
+import pytest
+
+from runner.graph.graph import load_graph
+
+ROOT = Path(__file__).parents[2]
+NEEDED = {
+    "bop.yaml": ("camera.dataset=data", "detector.detections=boxes.json", "results.path=out.csv"),
+    "reference.yaml": ("camera.dataset=data",),
+}
+GRAPHS = [ROOT / "graph.yaml", *sorted((ROOT / "graphs").glob("*.yaml"))]
+SEARCHING = [graph for graph in GRAPHS if "stages.hypotheses:Hypotheses" in graph.read_text()]
+
+
+@pytest.mark.parametrize("path", SEARCHING, ids=lambda path: path.name)
+def test_the_number_of_objects_may_be_found(path: Path) -> None:
+    graph = load_graph(path, ("hypotheses.n_objects=auto", *_needed(path)))
+    assert graph.nodes["hypotheses"].config.n_objects == "auto"
+
+
+@pytest.mark.parametrize("path", GRAPHS, ids=lambda path: path.name)
+def test_a_catalogue_is_beside_the_graph_in_every_stage(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    home = tmp_path / "home"
+    (home / "ours").mkdir(parents=True)
+    (home / "ours" / "objects.yaml").touch()
+    text = path.read_text().replace("stages/scene/catalogue.yaml", "ours/objects.yaml")
+    (home / path.name).write_text(text.replace('"${camera.dataset}/models"', "ours/objects.yaml"))
+    graph = load_graph(home / path.name, _needed(path))
+    found = {name: node.config.catalogue for name, node in graph.nodes.items() if hasattr(node.config, "catalogue")}
+    assert len(found) >= 4 and set(found.values()) == {home / "ours" / "objects.yaml"}
+
+
+def _needed(path: Path) -> tuple[str, ...]:
+    return NEEDED.get(path.name, ())
