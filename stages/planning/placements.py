@@ -35,12 +35,14 @@ class Scene:
     T_base_table: Floats
     surface: Region | None = None
     """Of the table, in its frame, as far as it was seen; None where that is not known."""
+    eye: Floats | None = None
+    """Where the camera is, in the table's frame; None where that is not known."""
 
     @staticmethod
     def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
         """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy."""
         standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
-        scene = Scene({}, carriers(graph), graph.T_base_table, graph.support)
+        scene = Scene({}, carriers(graph), graph.T_base_table, graph.support, _eye(graph))
         while standing:
             name = next(name for name in standing if scene.supports[name] not in standing)
             item = standing.pop(name)
@@ -67,6 +69,10 @@ class Scene:
             chain.add(support)
             support = self.supports[support]
         return [item for item in self.standing.values() if item.name not in chain]
+
+
+def _eye(graph: SceneGraph) -> Floats | None:
+    return None if graph.T_base_camera is None else (inverse(graph.T_base_table) @ graph.T_base_camera)[:3, 3]
 
 
 @dataclass(frozen=True)

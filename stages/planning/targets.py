@@ -13,6 +13,7 @@ from stages.perception.poses import inverse
 from stages.planning.placements import Placement, Placements, Scene
 from stages.planning.problem import TABLE
 from stages.planning.search import Step
+from stages.planning.sight import hidden_share
 from stages.scene import regions
 from stages.scene.catalogue import Floats, Grasp
 from stages.scene.standing import Standing
@@ -23,6 +24,11 @@ HAND = (0.14, 0.05)
 """Length along the approach and thickness of the gripper with its fingers, metres."""
 FINGER = 0.035
 """Room that an opening finger takes beside the object, metres."""
+MIDDLE = 0.01
+"""Metres from the edge of a surface, half of the way on small ones, where the middle of what overhangs it must stay."""
+HIDDEN = 0.1
+"""Cost of a place that other objects hide wholly from the camera, in metres of shift: nobody has seen it free, and
+nobody will see what stands there."""
 CROWDED = 0.08
 """Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
 
@@ -118,18 +124,35 @@ class Targets:
         return chosen
 
     def _goal_poses(self, step: Step, scene: Scene) -> list[Placement] | Blocked:
+        """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle."""
         placements = self._placements.of(step, scene)
-        strict = self._free(step, scene, placements, strict=True)
-        return strict if isinstance(strict, list) else self._free(step, scene, placements, strict=False)
+        placements = self._seen_first(placements, step, scene) if step.region else placements
+        for margin in () if step.destination == TABLE else (self._workspace.clearance, 0.0):
+            found = self._free(step, scene, placements, margin=margin)
+            if isinstance(found, list):
+                return found
+        return self._free(step, scene, placements, margin=None)
+
+    def _seen_first(self, placements: Sequence[Placement], step: Step, scene: Scene) -> list[Placement]:
+        """Sorted again: of the places that look alike around a symmetric parent those come later that are hidden."""
+        others = scene.others(step.item, step.destination)
+        hidden: dict[tuple[float, ...], float] = {}
+        sorted_again: list[Placement] = []
+        for one in placements:
+            place = tuple(np.round(one.standing.T_table_stance[:2, 3] / ALIKE[0]))
+            if place not in hidden:
+                hidden[place] = _hidden(one.standing, others, scene)
+            sorted_again.append(Placement(one.standing, one.cost + hidden[place]))
+        return sorted(sorted_again, key=lambda placement: placement.cost)
 
     def _free(
-        self, step: Step, scene: Scene, placements: Sequence[Placement], *, strict: bool
+        self, step: Step, scene: Scene, placements: Sequence[Placement], *, margin: float | None
     ) -> list[Placement] | Blocked:
         """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
         others = scene.others(step.item, step.destination)
         valid: list[Placement] = []
         blocking: list[tuple[str, ...]] = []
-        supported = (p for p in placements if self._supported(p.standing, step.destination, scene, strict=strict))
+        supported = (p for p in placements if self._supported(p.standing, step.destination, scene, margin))
         for placement in islice(supported, self._workspace.considered):
             if any(_alike(placement.standing, other.standing) for other in valid):
                 continue
@@ -144,16 +167,21 @@ class Targets:
                 break
         return valid or Blocked(step, min(blocking, key=lambda hit: _effort(hit, scene), default=()))
 
-    def _supported(self, item: Standing, destination: str, scene: Scene, *, strict: bool) -> bool:
-        """Whether the surface carries the object: wholly and within reach, inside the cavity, or by its middle."""
+    def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
+        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
+
+        The table always carries all of it, within reach of the arm.
+        """
         if destination == TABLE:
             within_reach = self._workspace.outside(scene.T_base_table @ item.T_table_object) == 0
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
-        if strict and carrier.stance.cavity:
-            return regions.inside(item.bottom, surface)
-        return bool(regions.depth(surface, regions.centroid(item.bottom)[None])[0] >= 0)
+        if margin is not None:
+            return regions.inside(item.bottom, surface, margin=margin)
+        middles = np.stack([regions.centroid(item.bottom), regions.centroid(surface)])
+        depth, deepest = regions.depth(surface, middles)
+        return bool(depth >= min(MIDDLE, 0.5 * deepest))
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
@@ -175,7 +203,7 @@ class Targets:
                 continue
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
             crowded = max(0.0, self._workspace.spacing - min(room, free))
-            spots.append(Placement(spot, 0.2 * distance + 2 * crowded))
+            spots.append(Placement(spot, 0.2 * distance + 2 * crowded + _hidden(spot, others, scene)))
         spots.sort(key=lambda placement: placement.cost)
         return spots[: 2 * self._workspace.targets] or Blocked(step, ())
 
@@ -221,6 +249,11 @@ def _clearance(a: Standing, b: Standing) -> float:
     """Gap between footprints, metres, negative where they overlap; infinite where one is above the other."""
     apart = a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING
     return np.inf if apart else regions.separation(a.outline, b.outline)
+
+
+def _hidden(item: Standing, others: Sequence[Standing], scene: Scene) -> float:
+    """What it costs that the camera does not see an object at a place, metres."""
+    return 0.0 if scene.eye is None else HIDDEN * hidden_share(item, others, scene.eye)
 
 
 def _share_of_grasps(item: Standing, others: Sequence[Standing]) -> float:

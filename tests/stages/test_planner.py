@@ -13,11 +13,12 @@ from stages.devices import tabletop
 from stages.messages import Plan, Task
 from stages.perception.poses import inverse
 from stages.planner import Planner
+from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
 from stages.scene import regions
 from stages.scene.standing import Standing, yawed
 from stages.scene.virtual import satisfied
-from tests.stages.layouts import CATALOGUE, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
+from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
 
 
 @cache
@@ -302,6 +303,34 @@ def test_settings_are_checked():
         Workspace(x=(1.0, 0.5))
     with pytest.raises(Refused, match=r"planner\.gripper_width=0: must be a positive"):
         Planner.Config(catalogue=CATALOGUE, gripper_width=0)
+
+
+def test_a_place_that_the_camera_does_not_see_comes_last():
+    """Of the places around a carton that look alike, those in front of it and beside it."""
+    goal = Layout().put("milk_carton", 0.1, 0.0).put("salt_shaker", 0.18, 0.0)
+    start = Layout().put("milk_carton", 0.1, 0.0).put("salt_shaker", 0.0, 0.3)
+    (transfer,) = plan(goal, start).transfers
+    items = [
+        Standing.at("salt_shaker", stances("salt_shaker"), inverse(T_BASE_TABLE) @ T) for T in transfer.T_base_targets
+    ]
+    carton = Standing.at("milk_carton", stances("milk_carton"), start.poses["milk_carton"])
+    eye = (inverse(T_BASE_TABLE) @ T_BASE_CAMERA)[:3, 3]
+    assert hidden_share(items[0], [carton], eye) == 0.0
+    assert reached(goal, executed(start, plan(goal, start)))
+
+
+@pytest.mark.parametrize("upper", ["tuna_can", "salt_shaker", "soup_can"])
+def test_an_object_stands_wholly_on_what_carries_it_with_a_margin(upper: str):
+    """Also where the goal was shown with an edge over the side."""
+    goal = Layout().put("cereal_box", 0.0, 0.0).put(upper, 0.0, 0.045, on="cereal_box")
+    start = Layout().put("cereal_box", 0.0, 0.0).put(upper, 0.1, 0.25)
+    (transfer,) = plan(goal, start).transfers
+    carrier = Standing.at("cereal_box", stances("cereal_box"), start.poses["cereal_box"])
+    for T in transfer.T_base_targets:
+        item = Standing.at(upper, stances(upper), inverse(T_BASE_TABLE) @ T)
+        middle = regions.depth(carrier.top, regions.centroid(item.bottom)[None])[0]
+        wide = np.ptp(item.bottom, axis=0).max() + 2 * Workspace().clearance > np.ptp(carrier.top, axis=0).min()
+        assert middle >= 0.01 if wide else regions.inside(item.bottom, carrier.top, margin=Workspace().clearance)
 
 
 @settings(max_examples=30, deadline=None)
