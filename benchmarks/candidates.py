@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Truth, truths_by_image
@@ -48,12 +49,12 @@ def found(truth: Truth, candidates: Candidates, label: str, sensor: str) -> Foun
     overlaps = intersection_over_union(truth.box[None], boxes)[0]
     right = np.array([candidate.label == label for candidate in candidates.candidates], bool)
     hits = np.flatnonzero(right & (overlaps > _OVERLAP))
-    best = candidates.confidences[overlaps.argmax()] if len(boxes) else np.zeros(len(candidates.labels))
+    likely = [candidates.labels[int(row.argmax())] for row in candidates.confidences]
     return Found(
         sensor=sensor,
         rank=float(hits[0]) + 1 if len(hits) else np.inf,
         precise=bool((right & (overlaps > 0.75)).any()),
-        top=candidates.labels[int(best.argmax())] == label,
+        top=bool(likely) and likely[int(overlaps.argmax())] == label,
     )
 
 
@@ -92,6 +93,20 @@ def _frame(image: BopImage, index: int, total: int) -> Frame:
     return Frame(rgb=rgb, depth=depth, K=image.K, T_base_camera=None, robot_mask=None, name=name, **ids)
 
 
+def picture(image: BopImage, candidates: Candidates, truths: Sequence[Truth]) -> Image.Image:
+    """The image with the true boxes (white) and the candidates, the more confident the brighter."""
+    drawn = Image.fromarray(image.read()[0])
+    draw = ImageDraw.Draw(drawn)
+    for candidate in reversed(candidates.candidates):
+        shade = (255, int(255 * min(1.0, 1.3 * candidate.confidence)), 0)
+        draw.rectangle(tuple(candidate.box.tolist()), outline=shade, width=2)
+        x, y = candidate.box[:2].tolist()
+        draw.text((x + 4, y + 3), f"{candidate.label} {candidate.confidence:.2f}", fill=shade)
+    for box in (truth.box for truth in truths if truth.box is not None):
+        draw.rectangle(tuple(box.tolist()), outline="white", width=1)
+    return drawn
+
+
 def looked_at(dataset: Path, detector: ModelDetector) -> Iterator[tuple[BopImage, Candidates, float]]:
     """Every image with its candidates and the seconds they took."""
     images = read_dataset(dataset)
@@ -110,6 +125,7 @@ def main() -> int:
     parser.add_argument("--catalogue", type=Path, help="by default the data set's models")
     parser.add_argument("--learned", type=Path, help="by default the catalogue is learned now and kept in the cache")
     parser.add_argument("--most", type=int, default=20, help="candidates an image")
+    parser.add_argument("--pictures", type=Path, help="folder for every image with its candidates and true boxes")
     options = parser.parse_args()
     path = options.catalogue or options.dataset / "models"
     names = {item.label: name for name, item in Catalogue.shared(path).objects.items()}
@@ -126,6 +142,9 @@ def main() -> int:
             f"{image.scene_id}/{image.image_id}: {len(seen)} objects, {seconds:.2f} s", *missed and ["missed", *missed]
         )
         rows += fates
+        if options.pictures:
+            options.pictures.mkdir(parents=True, exist_ok=True)
+            picture(image, candidates, seen).save(options.pictures / f"{image.scene_id:06d}-{image.image_id:06d}.png")
     print(table(rows, options.most))
     return 0
 

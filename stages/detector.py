@@ -102,11 +102,14 @@ class ModelDetector(Stage):
                 raise Refused(f"detector.floor = {self.floor}: must lie from 0 to below 1")
 
     def __init__(self, config: Config) -> None:
+        import cv2
         import torch
 
         from stages.perception.detection.propose import Proposer
         from stages.perception.detection.views import Views
 
+        # As for the network above: superpixels are sums too.
+        cv2.setNumThreads(1)
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("error")
         self._config = config

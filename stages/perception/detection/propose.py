@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.perception.boxes import suppress
+from stages.perception.boxes import intersection_over_union
 from stages.perception.detection.appearance import Bytes
 from stages.perception.detection.labels import Judge
 from stages.perception.detection.regions import Region, regions
@@ -23,8 +23,10 @@ _OUTLINE = 0.5
 """What a clear outline counts beside likeness."""
 _SHARPNESS, _BACKGROUND = 0.35, 4.5
 """Scores to confidences: the difference that counts e, and the score at which a region is as likely nothing known."""
-_SAME = 0.5
-"""Overlap of boxes with one label that are one object."""
+_PLACE, _SAME = 0.5, 0.6
+"""Overlap of boxes that show the same place, and of boxes that with one label are one candidate."""
+_AGAIN = 0.6
+"""What a candidate is worth beside one of its label, or of its place, that is chosen already."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +71,21 @@ def _confidences(found: list[Region], scores: Floats) -> Floats:
 
 
 def _chosen(found: list[Region], confidences: Floats, step: int, most: int) -> Proposals:
-    """Every box with every label, the best first, without boxes of one label that overlap."""
+    """The most confident boxes with labels, best first.
+
+    What has the label, or the place, of one that is chosen already is worth less: an object that is there once should
+    not fill the list with pieces of itself, nor one box with all its labels.
+    """
     boxes = np.stack([region.box for region in found])
-    count, labels = confidences.shape
-    which, label = np.repeat(np.arange(count), labels), np.tile(np.arange(labels), count)
-    leading = np.argsort(-confidences.ravel(), kind="stable")[: 40 * most]
-    which, label = which[leading], label[leading]
-    kept = suppress(boxes[which], confidences[which, label], _SAME, labels=label)[:most]
-    return Proposals(step * boxes[which[kept]], label[kept], confidences[which[kept]])
+    overlaps = intersection_over_union(boxes, boxes)
+    worth = confidences.copy()
+    chosen: list[tuple[int, int]] = []
+    while len(chosen) < most and worth.max() > 0:
+        region, label = divmod(int(worth.argmax()), worth.shape[1])
+        chosen.append((region, label))
+        worth[:, label] *= _AGAIN
+        worth[overlaps[region] > _PLACE] *= _AGAIN
+        worth[overlaps[region] > _SAME, label] = 0
+    chosen.sort(key=lambda pair: -confidences[pair])
+    which, label = np.array(chosen, np.int64).reshape(-1, 2).T
+    return Proposals(step * boxes[which], label, confidences[which])

@@ -65,11 +65,11 @@ class Views:
     """112 x _CHANNELS."""
 
     @staticmethod
-    def learn(catalogue: Catalogue) -> Views:
-        """Renders every object in every way it rests on a plane, from all sides; about 3 s an object."""
+    def learn(catalogue: Catalogue, *, azimuths: int = _AZIMUTHS) -> Views:
+        """Renders every object in every way it rests on a plane, from so many sides at each of four elevations."""
         renderer = Renderer(_SIZE, _SIZE)
         items = enumerate(catalogue.objects.values())
-        rendered = [(index, *view) for index, item in items for view in _views(item, renderer)]
+        rendered = [(index, *view) for index, item in items for view in _views(item, renderer, azimuths)]
         renderer.close()
         label, elevation, extent, top, pieces = zip(*rendered, strict=True)
         looks = Looks.of(pieces)
@@ -164,7 +164,7 @@ def _basis(looks: Looks) -> Float32s:
 
 
 def _views(
-    item: CatalogueObject, renderer: Renderer
+    item: CatalogueObject, renderer: Renderer, azimuths: int
 ) -> Iterator[tuple[float, tuple[float, float], float, tuple[Bytes, Mask]]]:
     """Elevation, extent, top, crop and mask of every view of an object."""
     middle = item.bounds.mean(0)
@@ -177,7 +177,7 @@ def _views(
         top = float(np.ptp(item.mesh.vertices @ R[2]))
         placed = Item(item.mesh, transform(R, -R @ middle))
         for elevation in _ELEVATIONS:
-            for direction in _directions(elevation):
+            for direction in _directions(elevation, azimuths):
                 camera = Camera(K, looking_at(distance * direction, np.zeros(3)))
                 T = np.linalg.inv(camera.T_world_camera) @ placed.T_world_item
                 inverse = inverse_depth(soup, T, View.of(K, _SIZE, _SIZE))
@@ -192,10 +192,10 @@ def _views(
                     )
 
 
-def _directions(elevation: float) -> Floats:
-    """Unit vectors from the object to the camera, _AZIMUTHS x 3."""
-    up, around = np.deg2rad(elevation), np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
-    return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.full(_AZIMUTHS, np.sin(up))], 1)
+def _directions(elevation: float, azimuths: int) -> Floats:
+    """Unit vectors from the object to the camera, azimuths x 3."""
+    up, around = np.deg2rad(elevation), np.arange(azimuths) * 2 * np.pi / azimuths
+    return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.full(azimuths, np.sin(up))], 1)
 
 
 def _lighting(direction: Floats) -> Lighting:
