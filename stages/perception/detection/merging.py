@@ -105,8 +105,8 @@ def _pairs(labels: Labels, depth: NDArray[np.floating], edges: Mask, jumps: Mask
     for ahead, behind in ((np.s_[2:], np.s_[:-2]), (np.s_[:, 2:], np.s_[:, :-2])):
         a, b = labels[behind], labels[ahead]
         apart = a != b
-        a, b, near, far = a[apart].astype(np.int64), b[apart], depth[behind][apart], depth[ahead][apart]
-        step = np.where(a < b, near - far, far - near)
+        a, b, z_a, z_b = a[apart].astype(np.int64), b[apart], depth[behind][apart], depth[ahead][apart]
+        step = np.where(a < b, z_a - z_b, z_b - z_a)
         on_edge, on_jump = ((marks[behind] | marks[ahead])[apart] for marks in (edges, jumps))
         keys.append(np.minimum(a, b) * count + np.maximum(a, b))
         columns = [np.ones(len(a)), on_edge, on_jump, np.abs(step), step > _HIDES, step < -_HIDES]

@@ -28,7 +28,7 @@ def test_folding_normalisation_changes_nothing(network: Backbone) -> None:
     plain = functional.conv2d(functional.pad(image, (0, 1, 0, 1)), state["_conv_stem.weight"], stride=2)
     norm = [state[f"_bn0.{name}"] for name in ("running_mean", "running_var", "weight", "bias")]
     expected = functional.batch_norm(plain, *norm, eps=1e-3)
-    torch.testing.assert_close(network.stem(image), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(network.stem(image), expected, rtol=1e-4, atol=1e-3)
 
 
 def test_strides_and_channels_are_those_of_the_published_network(network: Backbone) -> None:
@@ -51,4 +51,4 @@ def test_features_see_what_the_mask_covers_and_nothing_else(network: Backbone) -
 def test_how_many_crops_come_at_once_does_not_matter(network: Backbone) -> None:
     images, masks = crops(19)
     together = network.features(images, masks)
-    np.testing.assert_allclose(together.last[17], network.features(images[17:18], masks[17:18]).last[0], atol=1e-4)
+    np.testing.assert_allclose(together.last[17], network.features(images[17:18], masks[17:18]).last[0], atol=1e-3)

@@ -27,7 +27,7 @@ def test_sizes_are_metres() -> None:
     of_bowl = learned.label == NAMES.index("bowl")
     width, _, height = OBJECTS["bowl"].dimensions
     np.testing.assert_allclose(learned.top[of_bowl], height, atol=0.002)
-    np.testing.assert_allclose(learned.extent[of_bowl, 0], width, rtol=0.1)
+    np.testing.assert_allclose(learned.extent[of_bowl, 0], width, rtol=0.15)
 
 
 def test_the_file_is_small_and_gives_back_what_was_learned(tmp_path: Path) -> None:
@@ -53,9 +53,10 @@ def test_something_else_is_refused_with_the_command_that_makes_views(tmp_path: P
 
 
 def test_a_catalogue_is_learned_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = views()
     learned: list[Catalogue] = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(Views, "learn", lambda catalogue: learned.append(catalogue) or views())
+    monkeypatch.setattr(Views, "learn", lambda catalogue: learned.append(catalogue) or made)
     assert Views.cached(OBJECTS).labels == Views.cached(OBJECTS).labels == NAMES
     bowl = OBJECTS["bowl"]
     other = replace(bowl, mesh=replace(bowl.mesh, colors=255 - bowl.mesh.colors))
@@ -66,11 +67,12 @@ def test_a_catalogue_is_learned_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_the_command_writes_the_file_and_refuses_what_is_no_catalogue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(Views, "learn", lambda _: views())
+    made = views()
+    monkeypatch.setattr(Views, "learn", lambda _: made)
     catalogue = Path(__file__).parents[4] / "stages/scene/catalogue.yaml"
     monkeypatch.setattr("sys.argv", ["learn", str(catalogue), str(tmp_path / "out.safetensors")])
     assert learn.main() == 0
-    assert capsys.readouterr().out.startswith(f"3 objects, {len(views().label)} views, ")
+    assert capsys.readouterr().out.startswith(f"3 objects, {len(made.label)} views, ")
     monkeypatch.setattr("sys.argv", ["learn", str(tmp_path / "absent"), str(tmp_path / "out")])
     assert learn.main() == 1
     assert "no such catalogue" in capsys.readouterr().err
