@@ -17,7 +17,7 @@ from tests.stages.perception.scenes import CATALOGUE, upright
 
 NAMES = ("bowl", "cereal_box", "sauce_bottle")
 OBJECTS = Catalogue({name: CATALOGUE[name] for name in NAMES})
-K = np.array([[280.0, 0.0, 159.5], [0.0, 280.0, 119.5], [0.0, 0.0, 1.0]])
+K = np.array([[420.0, 0.0, 159.5], [0.0, 420.0, 119.5], [0.0, 0.0, 1.0]])
 VIEW = View.of(K, 320, 240)
 T_TABLE_CAMERA = looking_at(np.array([0.15, -0.75, 0.55]), np.array([0.0, 0.0, 0.03]))
 _TABLE = Mesh(

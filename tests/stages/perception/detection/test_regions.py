@@ -30,7 +30,7 @@ def test_each_object_is_a_region_with_its_size(name: str) -> None:
     assert 25 < region.elevation < 50
     x0, y0, x1, y1 = region.box
     assert region.mask.shape == (y1 - y0, x1 - x0)
-    assert region.extent == pytest.approx(((x1 - x0) / 280 * 0.9, (y1 - y0) / 280 * 0.9), rel=0.2)
+    assert region.extent == pytest.approx(((x1 - x0) / 420 * 0.9, (y1 - y0) / 420 * 0.9), rel=0.2)
 
 
 def test_the_clearest_regions_come_first() -> None:
