@@ -77,7 +77,7 @@ def test_the_table_is_the_support_and_heights_are_above_it() -> None:
 
 def test_a_wall_before_a_level_camera_is_a_support_only_where_gravity_does_not_say_otherwise() -> None:
     rays = VIEW.rays()
-    floor = 0.3 / np.maximum(rays[..., 1], 1e-3)
+    floor = 0.15 / np.maximum(rays[..., 1], 1e-3)
     depth = np.minimum(floor, 1.0).astype(np.float32)
     up = np.array([0.0, -1.0, 0.0])
     assert all(normal == pytest.approx(up, abs=0.02) for normal in planes(depth, up))
