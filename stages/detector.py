@@ -1,4 +1,4 @@
-"""Frame in, candidate boxes out: by the trained network, or as a file of detections has them."""
+"""Frame in, candidate boxes out: by the trained network, by the objects' meshes, or as a file has them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from stages.messages import Candidate, Candidates, Frame
 from stages.perception.duplicates import distinct
 from stages.scene.catalogue import Catalogue, Floats
 
+_FAR = np.float32(100.0)
+"""Metres: the robot's own body is put where no object is looked for."""
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
 
 
@@ -75,6 +77,69 @@ class Detector(Stage):
         objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
         kept = slice(sure if config.expected == "auto" or objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels)
+        ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
+        return message
+
+
+class ModelDetector(Stage):
+    """Looks for the objects of a catalogue in RGB-D photographs by their meshes: no network is trained.
+
+    A box comes once for every label that it may well have, each time with the confidences of all labels.
+    """
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """Settings."""
+
+        catalogue: Path
+        learned: Path | None = None
+        """What ``python -m stages.perception.detection.learn`` made of the catalogue; None learns it at the start,
+        which takes minutes the first time, and keeps it in the user's cache."""
+        max_candidates: int = 20
+        floor: float = 0.0
+        """Confidence below which a candidate is left out."""
+
+        def __post_init__(self) -> None:
+            if self.max_candidates < 1:
+                raise Refused(f"detector.max_candidates = {self.max_candidates}: must be at least 1")
+            if not 0 <= self.floor < 1:
+                raise Refused(f"detector.floor = {self.floor}: must lie from 0 to below 1")
+
+    def __init__(self, config: Config) -> None:
+        import cv2
+        import torch
+
+        from stages.perception.detection.propose import Proposer
+        from stages.perception.detection.views import Views
+
+        # As for the network above: superpixels are sums too.
+        cv2.setNumThreads(1)
+        torch.set_num_threads(1)
+        torch.set_deterministic_debug_mode("error")
+        self._config = config
+        catalogue = Catalogue.shared(config.catalogue)
+        views = Views.load(config.learned) if config.learned else Views.cached(catalogue)
+        if set(views.labels) != set(catalogue.objects):
+            raise Refused(
+                f"detector.learned: {config.learned} has the views of {', '.join(views.labels)}, but the objects of "
+                f"{config.catalogue} are {', '.join(catalogue.objects)}; learn the catalogue again"
+            )
+        self._proposer = Proposer(views)
+
+    def on_frame(self, frame: Frame, ctx: Context) -> Candidates:
+        """The frame's candidates, most confident first."""
+        depth = np.where(np.isfinite(frame.depth), frame.depth, np.float32(0))
+        if frame.robot_mask is not None:
+            depth[frame.robot_mask] = _FAR
+        up = None if frame.T_base_camera is None else frame.T_base_camera[2, :3]
+        found = self._proposer.propose(frame.rgb, depth, frame.K, ctx.rng, up=up, most=self._config.max_candidates)
+        labels = self._proposer.labels
+        rows = zip(found.boxes, found.labels, found.confidences, strict=True)
+        candidates = tuple(Candidate(box=box, label=labels[k], confidence=float(row[k])) for box, k, row in rows)
+        kept = [i for i, candidate in enumerate(candidates) if candidate.confidence >= self._config.floor]
+        message = Candidates(
+            candidates=tuple(candidates[i] for i in kept), labels=labels, confidences=found.confidences[kept]
+        )
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message
 

@@ -29,6 +29,7 @@ GRAPHS = {
     "tray": (),
     "interactive": (),
     "reference": (),
+    "photos": ("--set", "camera.dataset=d", "--set", "results.path=d.csv"),
     "bop": ("--set", "camera.dataset=d", "--set", "detector.detections=d.json", "--set", "results.path=d.csv"),
 }
 HELLO = """

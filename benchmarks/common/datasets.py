@@ -34,6 +34,8 @@ class Truth:
     """4 x 4, metres."""
     visible: float = 1.0
     """Share of its silhouette that can be seen; 1 where the data set does not say."""
+    box: Floats | None = None
+    """Of what can be seen: x0, y0, x1, y1 in pixels; None where the data set does not say."""
 
 
 @dataclass(frozen=True)
@@ -152,4 +154,11 @@ def _scene_truth(file: Path) -> Iterator[Truth]:
         for item, info in zip(items, infos.get(image, [{}] * len(items)), strict=True):
             T = pose(np.array(item["cam_R_m2c"], float).reshape(3, 3), np.array(item["cam_t_m2c"], float) / 1000)
             visible = float(info.get("visib_fract", 1.0))
-            yield Truth((int(file.parent.name), int(image)), int(item["obj_id"]), T, visible)
+            yield Truth((int(file.parent.name), int(image)), int(item["obj_id"]), T, visible, _box(info))
+
+
+def _box(info: dict[str, Any]) -> Floats | None:
+    if "bbox_visib" not in info:
+        return None
+    x, y, width, height = info["bbox_visib"]
+    return np.array([x, y, x + width, y + height], float)

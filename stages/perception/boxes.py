@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -30,16 +32,19 @@ def suppress(boxes: Floats, scores: Floats, overlap: float, *, labels: NDArray[n
     A box goes when a better one overlaps it by more than ``overlap`` (of the same label, where labels are
     given). Equal scores keep their order, so the result is deterministic.
     """
-    overlaps = intersection_over_union(boxes, boxes) > overlap
-    if labels is not None:
-        overlaps &= labels[:, None] == labels[None]
+    return list(survivors(boxes, scores, overlap, labels=labels))
+
+
+def survivors(
+    boxes: Floats, scores: Floats, overlap: float, *, labels: NDArray[np.int64] | None = None
+) -> Iterator[int]:
+    """As :func:`suppress`, one after the other: who needs only the first of thousands does not pay for the rest."""
     alive = np.ones(len(boxes), bool)
-    kept: list[int] = []
     for i in np.argsort(-scores, kind="stable"):
         if alive[i]:
-            kept.append(int(i))
-            alive &= ~overlaps[i]
-    return kept
+            yield int(i)
+            gone = intersection_over_union(boxes[i : i + 1], boxes)[0] > overlap
+            alive &= ~gone if labels is None else ~(gone & (labels == labels[i]))
 
 
 def encode_offsets(anchors: Tensor, boxes: Tensor) -> Tensor:

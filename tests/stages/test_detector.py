@@ -7,17 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from runner.contract import Refused
 from runner.testing import run_stage
-from stages.detector import Detector, RecordedDetections
+from stages.detector import Detector, ModelDetector, RecordedDetections
+from stages.devices.clutter import write_models
 from stages.devices.detector_data import examples
 from stages.messages import Candidates, Frame
 from stages.perception.detection_evaluation import evaluate
 from stages.perception.detection_network import DetectionNetwork, Detections
 from stages.scene.catalogue import Catalogue
+from tests.stages.perception.detection.scenes import NAMES, OBJECTS, photograph, views
 
 ROOT = Path(__file__).parents[2]
 CATALOGUE = ROOT / "stages/scene/catalogue.yaml"
@@ -121,6 +124,55 @@ def test_bad_settings_are_refused_with_the_valid_choices(tmp_path: Path) -> None
         Detector(Detector.Config(labels=("fork", "cup")))
     with pytest.raises(Refused, match=r"absent\.safetensors"):
         Detector(Detector.Config(weights=tmp_path / "absent.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("learned") / "views.safetensors"
+    views().save(path)
+    return path
+
+
+def by_models(catalogue: Path, learned: Path, **settings: Any) -> ModelDetector:
+    return ModelDetector(ModelDetector.Config(catalogue=catalogue, learned=learned, **settings))
+
+
+def written(folder: Path) -> Path:
+    write_models(folder / "models", OBJECTS)
+    return folder / "models"
+
+
+def test_objects_are_found_by_their_meshes(learned: Path, tmp_path: Path) -> None:
+    seen = photograph(*NAMES)
+    (message,) = run_stage(by_models(written(tmp_path), learned, max_candidates=8), [seen.frame()])
+    assert message.labels == NAMES and message.confidences.shape == (8, 3)
+    assert {candidate.label for candidate in message.candidates} == set(NAMES)
+    for candidate, row in zip(message.candidates, message.confidences, strict=True):
+        assert candidate.confidence == row[NAMES.index(candidate.label)]
+        assert row.sum() < 1
+    scores = [candidate.confidence for candidate in message.candidates]
+    assert scores == sorted(scores, reverse=True)
+    kept = by_models(written(tmp_path), learned, max_candidates=8, floor=scores[2])
+    (fewer,) = run_stage(kept, [seen.frame()])
+    assert len(fewer.candidates) == len(fewer.confidences) == 3
+
+
+def test_the_robots_own_body_is_no_object(learned: Path, tmp_path: Path) -> None:
+    seen = photograph("cereal_box")
+    x0, y0, x1, y1 = seen.boxes["cereal_box"].astype(int)
+    mask = np.zeros(seen.depth.shape, bool)
+    mask[y0 - 4 : y1 + 4, x0 - 4 : x1 + 4] = True
+    hidden = msgspec.structs.replace(seen.frame(), robot_mask=mask)
+    (message,) = run_stage(by_models(written(tmp_path), learned), [hidden])
+    assert all(candidate.confidence < 0.3 for candidate in message.candidates)
+
+
+def test_views_of_another_catalogue_are_refused(learned: Path) -> None:
+    with pytest.raises(Refused, match=r"views of bowl, cereal_box, sauce_bottle, but the objects of .* are tray, "):
+        by_models(CATALOGUE, learned)
+    for settings, message in (({"max_candidates": 0}, "max_candidates = 0"), ({"floor": 1.0}, r"floor = 1\.0")):
+        with pytest.raises(Refused, match=message):
+            ModelDetector.Config(catalogue=CATALOGUE, **settings)
 
 
 def recorded(tmp_path: Path, entries: list[dict[str, Any]]) -> RecordedDetections:

@@ -9,6 +9,7 @@ from runner.graph.graph import load_graph
 ROOT = Path(__file__).parents[2]
 NEEDED = {
     "bop.yaml": ("camera.dataset=data", "detector.detections=boxes.json", "results.path=out.csv"),
+    "photos.yaml": ("camera.dataset=data", "results.path=out.csv"),
     "reference.yaml": ("camera.dataset=data",),
 }
 GRAPHS = [ROOT / "graph.yaml", *sorted((ROOT / "graphs").glob("*.yaml"))]
