@@ -17,7 +17,7 @@ from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, Simula
 from stages.devices import fetch
 from stages.devices.tabletop import TABLE
 from stages.messages import Frame, Snapshot
-from tests.runner.recordings import manifest
+from tests.runner.recordings import manifest, put
 
 BUILT_IN = Path(stages.scene.__file__).parent / "catalogue.yaml"
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -117,7 +117,7 @@ def record(folder: Path, frames: list[Frame]) -> Path:
     for number, frame in enumerate(frames):
         id = f"camera.frame#{number}"
         sealed = codec.envelope(frame, id=id, lineage=id, time_ns=number, causes=())
-        writer.put(codec.Envelope, codec.pack(sealed))
+        put(writer, sealed)
     writer.close()
     return path
 
