@@ -19,7 +19,7 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import detections_file, images
 from benchmarks.estimate import Settings, estimates, results
 from runner.contract import Refused
-from stages.perception.particle_filter import IMPROVEMENTS
+from stages.perception.filter.particle_filter import IMPROVEMENTS
 from stages.scene.catalogue import Catalogue, Floats
 
 _BOUNDS = ((0.01, 10.0), (0.02, 15.0))

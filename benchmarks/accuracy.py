@@ -20,7 +20,9 @@ from benchmarks.common.datasets import ImageId, Truth, read_truth
 from stages.devices.bop import read_dataset
 from stages.devices.bop_results import Result, read_results
 from stages.messages.arrays import Depth, Intrinsics
-from stages.perception.metrics import (
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
+from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.metrics import (
     BOP_SHARES,
     BOP_SYMMETRY_STEP,
     add_s,
@@ -32,8 +34,6 @@ from stages.perception.metrics import (
     pose_errors,
     vsd,
 )
-from stages.perception.rasteriser import Soup, View, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 _POINTS = 2000
 _FLIP = np.deg2rad(15.0)

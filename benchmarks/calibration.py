@@ -2,7 +2,7 @@
 
 Renders piles of several kinds into FOLDER, each in two disjoint sets, estimates them from exact and from noisy boxes
 (kept there, so that a second call only fits), writes the constants of the training sets to
-``stages/perception/calibration.yaml`` and prints the reliability on the test sets.
+``stages/perception/confidence/calibration.yaml`` and prints the reliability on the test sets.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from benchmarks.common.pipeline import Estimate
 from benchmarks.estimate import Settings, estimates
 from stages.devices.clutter import Pile, write_clutter
 from stages.messages import Hypothesis, Observation, SceneEstimate
-from stages.perception.depth_noise import StructuredLight
-from stages.perception.doubt import (
+from stages.perception.confidence.doubt import (
     CONSTANTS,
     FEATURES,
     RIGHT_METRES,
@@ -41,10 +40,11 @@ from stages.perception.doubt import (
     judged,
     standardised,
 )
-from stages.perception.likelihood import ObservedScene
-from stages.perception.metrics import pose_errors
-from stages.perception.refinement import Placed, RefinementSettings, SceneRefiner
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
+from stages.perception.rendering.depth_noise import StructuredLight
 from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.metrics import pose_errors
 
 Truths = NDArray[np.bool_]
 _ROOT = Path(__file__).parents[1]

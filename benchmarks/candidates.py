@@ -20,7 +20,7 @@ from runner.testing import run_stage
 from stages.detector import ModelDetector
 from stages.devices.bop import BopImage, read_dataset
 from stages.messages import Candidates, Frame
-from stages.perception.boxes import intersection_over_union
+from stages.perception.detection.boxes import intersection_over_union
 from stages.scene.catalogue import Catalogue
 
 _VISIBLE = 1 / 3

@@ -15,13 +15,13 @@ from benchmarks.kernel import CATALOGUE, PARTICLES, SCENE, SHAPES, SIZES, _camer
 from stages.messages import Candidate, Hypothesis, Observation, Posterior
 from stages.messages.digest import Prospect
 from stages.particle_filter import ParticleFilter
-from stages.perception.evaluators import cuda_obstacle
-from stages.perception.evolution import Population, Step
-from stages.perception.likelihood import ObjectLikelihood
-from stages.perception.metrics import pose_errors
-from stages.perception.particle_filter import FilterSettings
-from stages.perception.proposals import Guess, Proposals
+from stages.perception.cuda.device import cuda_obstacle
+from stages.perception.filter.evolution import Population, Step
+from stages.perception.filter.likelihood import ObjectLikelihood
+from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.proposals import Guess, Proposals
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.metrics import pose_errors
 
 ITERATIONS = 200
 HYPOTHESES = 56
@@ -32,7 +32,7 @@ def exchanged(
     likelihood: ObjectLikelihood, poses: Floats, *, iterations: int = ITERATIONS, launch: Any = None
 ) -> float:
     """Milliseconds of costs where poses come from the host and costs go back."""
-    from stages.perception.cuda_batch import Batch, Look
+    from stages.perception.cuda.batch import Batch, Look
 
     batch = Batch([likelihood.shape], [Look.of(likelihood)], launch)
     return _milliseconds(lambda n: [batch.changes(poses) for _ in range(n)], iterations)
@@ -44,7 +44,7 @@ def resident(
 ) -> float:  # fmt: skip
     """Milliseconds per iteration of populations that stay on the device: costs, weights, resampling, transition,
     polish of as many particles as the filter's."""
-    from stages.perception.cuda_filter import CudaEvolution
+    from stages.perception.cuda.evolution import CudaEvolution
 
     settings = replace(FilterSettings(particles=len(poses)), schedule=None, device="cuda")
     proposals, T_camera_table = Proposals(item, 6), np.eye(4)
@@ -62,7 +62,7 @@ def resident(
 
 def _milliseconds(run: Any, iterations: int) -> float:
     """Wall time per iteration, after a few that compile and warm up."""
-    from stages.perception.cuda_math import cuda
+    from stages.perception.cuda.scalars import cuda
 
     run(min(3, iterations))
     cuda.synchronize()
@@ -74,7 +74,7 @@ def _milliseconds(run: Any, iterations: int) -> float:
 
 def deviation(likelihood: ObjectLikelihood, poses: Floats) -> float:
     """The greatest difference between the GPU's costs and the CPU's, as a share of the cost without the object."""
-    from stages.perception.cuda_batch import Batch, Look
+    from stages.perception.cuda.batch import Batch, Look
 
     changes = Batch([likelihood.shape], [Look.of(likelihood)]).changes(poses)
     return float(abs(likelihood.base + changes - likelihood.costs(poses)).max() / likelihood.base)
@@ -165,7 +165,7 @@ def main() -> None:
     if obstacle is not None:
         print(f"nothing measured: {obstacle}")
         return
-    from stages.perception.cuda_math import cuda
+    from stages.perception.cuda.scalars import cuda
 
     print(cuda.get_current_device().name)
     _costs(Catalogue.load(Path(CATALOGUE)))

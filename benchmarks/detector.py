@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import torch
 
-from stages.perception.detection_evaluation import Evaluation, evaluate
-from stages.perception.detection_network import DetectionNetwork, detect
-from stages.perception.training_images import Example, load_examples
+from stages.perception.detection.trained.evaluation import Evaluation, evaluate
+from stages.perception.detection.trained.network import DetectionNetwork, detect
+from stages.perception.detection.trained.training_images import Example, load_examples
 
 
 def print_evaluation(title: str, evaluation: Evaluation) -> None:

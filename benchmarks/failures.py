@@ -17,7 +17,7 @@ from benchmarks.accuracy import Score, described, failed, score
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, detections_file, images
 from stages.devices.bop_results import Result, read_results
-from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
+from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, Floats
 
 _TILE = 240

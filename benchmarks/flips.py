@@ -28,14 +28,14 @@ from stages.devices import fetch
 from stages.devices.bop_results import Result
 from stages.devices.tabletop import TABLE
 from stages.estimate import Quiet
+from stages.geometry.poses import exp_so3, inverse, pose
 from stages.messages import Candidate, Candidates, ObjectPose, Observation, SceneEstimate, Snapshot
-from stages.perception.likelihood import ObservedScene
-from stages.perception.poses import exp_so3, inverse, pose
-from stages.perception.preprocessing import preprocess
-from stages.perception.proposals import Proposals
-from stages.perception.rasteriser import Soup, View, inverse_depth
-from stages.perception.refinement import Placed, RefinementSettings, SceneRefiner
-from stages.perception.renderer import Camera, Item, Renderer
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.filter.proposals import Proposals
+from stages.perception.observation.preprocessing import preprocess
+from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
+from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 ROOT = Path(__file__).parents[1]

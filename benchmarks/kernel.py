@@ -15,9 +15,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from stages.perception.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.poses import compose, exp_so3, pose
-from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.geometry.poses import compose, exp_so3, pose
+from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 PARTICLES = 625

@@ -20,12 +20,12 @@ import numpy as np
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, detections_file, images
 from runner.process.children import ENVIRONMENT
-from stages.perception.combinations import cheapest, ordered
-from stages.perception.composition import FirstLook
-from stages.perception.likelihood import ObservedScene
-from stages.perception.particle_filter import FilterSettings, Track
-from stages.perception.preprocessing import preprocess
-from stages.perception.scene_filter import SceneFilter, SceneResult, Suspect
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.filter.particle_filter import FilterSettings, Track
+from stages.perception.hypotheses.combinations import cheapest, ordered
+from stages.perception.hypotheses.composition import FirstLook
+from stages.perception.hypotheses.scene_filter import SceneFilter, SceneResult, Suspect
+from stages.perception.observation.preprocessing import preprocess
 from stages.scene.catalogue import Catalogue
 
 Way = Literal["apart", "shared", "shared, dropped", "first look"]

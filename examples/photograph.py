@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from stages.devices.bop import read_dataset
 from stages.devices.bop_detections import read_detections
 from stages.estimate import Box, EstimatedScene, estimate_scene
-from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
+from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue
 
 HEADLIGHT = Lighting((Light("directional", (0.25, 0.4, 1.0), 2.8),), (0.45, 0.45, 0.45))

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.poses import is_pose
 from stages.messages import Frame, LookRequest, Snapshot
-from stages.perception.depth_noise import color_noise, structured_light
-from stages.perception.poses import is_pose
+from stages.perception.rendering.depth_noise import color_noise, structured_light
 from stages.scene.catalogue import Catalogue, Floats
 
 

@@ -29,9 +29,9 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.scene import SceneObject
+from stages.perception.confidence.memory import Memory
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
-from stages.scene.memory import Memory
 from stages.scene.virtual import satisfied
 
 

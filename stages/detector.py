@@ -12,7 +12,7 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.messages import Candidate, Candidates, Frame
-from stages.perception.duplicates import distinct
+from stages.perception.hypotheses.duplicates import distinct
 from stages.scene.catalogue import Catalogue, Floats
 
 _FAR = np.float32(100.0)
@@ -51,7 +51,7 @@ class Detector(Stage):
         # torch takes a second to load; whoever only reads a graph does without.
         import torch
 
-        from stages.perception.detection_network import DetectionNetwork, detect
+        from stages.perception.detection.trained.network import DetectionNetwork, detect
 
         # Sums over several threads are added in another order, which a replay would show as a difference.
         torch.set_num_threads(1)

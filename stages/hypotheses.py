@@ -9,7 +9,7 @@ from typing import Literal
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Candidates, Frame, Hypothesis, Observation
 from stages.messages.digest import Glimpse, Placed, Prospect, Sighting, Start
-from stages.perception.combinations import (
+from stages.perception.hypotheses.combinations import (
     additions_first,
     cheapest,
     count_combinations,
@@ -17,9 +17,9 @@ from stages.perception.combinations import (
     most_confident,
     ordered,
 )
-from stages.perception.composition import FirstLook, charge
-from stages.perception.duplicates import distinct
-from stages.perception.preprocessing import preprocess
+from stages.perception.hypotheses.composition import FirstLook, charge
+from stages.perception.hypotheses.duplicates import distinct
+from stages.perception.observation.preprocessing import preprocess
 
 OBJECT_COST = 0.1
 """With N_c unknown an object must explain a tenth of what readings all over its box would cost, as far above the plane

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.poses import pose
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
 from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
-from stages.perception.composition import charge
-from stages.perception.evaluators import DEVICES, chosen_device
-from stages.perception.likelihood import ObservedScene
-from stages.perception.particle_filter import FilterSettings, Track
-from stages.perception.poses import pose
-from stages.perception.scene_filter import Found, SceneFilter, Suspect
+from stages.perception.cuda.device import DEVICES, chosen_device
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.filter.particle_filter import FilterSettings, Track
+from stages.perception.hypotheses.composition import charge
+from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
 from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.naming import unique_names
 

@@ -17,7 +17,7 @@ from stages.planning.problem import TABLE, Problem, carriers, cycle
 from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.scene.catalogue import Catalogue, Floats
-from stages.scene.standing import Stances
+from stages.scene.stance import Stances
 from stages.scene.virtual import satisfied
 
 

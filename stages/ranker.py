@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.contract import Context, Stage
 from stages.messages import ObjectPose, Observation, Posterior, SceneEstimate
-from stages.perception.duplicates import is_same_scene, without_doubles
+from stages.perception.hypotheses.duplicates import is_same_scene, without_doubles
 from stages.scene.naming import Named, names_kept, unique_names
 
 

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.poses import pose
 from stages.messages import ObjectPose, Observation, SceneEstimate
-from stages.perception.doubt import Judge, annotated, judged
-from stages.perception.likelihood import ObservedScene
-from stages.perception.particle_filter import FilterSettings
-from stages.perception.poses import pose
-from stages.perception.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
+from stages.perception.confidence.doubt import Judge, annotated, judged
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.refinement.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
 
 

@@ -16,9 +16,9 @@ from stages.messages import (
     Snapshot,
     Verdict,
 )
-from stages.perception.scoring import errors
 from stages.scene.catalogue import Catalogue
 from stages.scene.episode import Episode, Look, markdown, plain, title
+from stages.scene.scoring import errors
 from stages.scene.text import certainty
 from stages.scene.truth import Truth
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.contract import Refused, Stage
+from stages.geometry.poses import inverse
 from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose, SceneObject
-from stages.perception.poses import inverse
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.relations import Tolerances
-from stages.scene.standing import Stances, Standing
+from stages.scene.stance import Stances, Standing
 
 
 class SceneGraphBuilder(Stage):

@@ -11,8 +11,8 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
+from stages.geometry.poses import pose
 from stages.messages import Arrange, Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
-from stages.perception.poses import pose
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01

@@ -14,7 +14,7 @@ from benchmarks.baselines.observed import Crop, Observed
 from benchmarks.baselines.registration import Model
 from benchmarks.common.datasets import Image
 from stages.messages import Candidate
-from stages.perception.rasteriser import Float32s, inverse_depth
+from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 Dof = Literal[3, 6]

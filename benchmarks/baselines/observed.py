@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from benchmarks.common.datasets import Image
 from stages.messages import Candidate
-from stages.perception.preprocessing import preprocess
-from stages.perception.rasteriser import Float32s, Soup, View, inverse_depth
+from stages.perception.observation.preprocessing import preprocess
+from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.scene.catalogue import Floats
 
 Region = tuple[int, int, int, int]

@@ -22,7 +22,7 @@ from benchmarks.baselines.icp import best, on_plane, rotations, starts
 from benchmarks.baselines.observed import Observed
 from benchmarks.baselines.registration import Model
 from benchmarks.common.datasets import Image
-from stages.perception.rasteriser import Float32s, View, inverse_depth
+from stages.perception.rendering.rasteriser import Float32s, View, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 
 _CELL = 0.04

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.baselines.common import Box, PerBox, untrained
 from benchmarks.baselines.icp import on_plane
-from stages.perception.poses import exp_so3, random_rotations
+from stages.geometry.poses import exp_so3, random_rotations
 from stages.scene.catalogue import Floats
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from stages.perception.rasteriser import Soup
+from stages.perception.rendering.rasteriser import Soup
 from stages.scene.catalogue import CatalogueObject, Floats
 
 _SAMPLES = 6000

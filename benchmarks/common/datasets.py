@@ -14,9 +14,9 @@ from runner.contract import Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
 from stages.estimate import Quiet
+from stages.geometry.poses import pose
 from stages.messages import Candidate, Candidates, Frame
 from stages.messages.arrays import Depth, Intrinsics, Rgb
-from stages.perception.poses import pose
 from stages.scene.catalogue import Floats
 
 ImageId = tuple[int, int]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from stages.perception.likelihood import CostForm, Window
-from stages.perception.rasteriser import Float32s, View
+from stages.perception.filter.likelihood import CostForm, Window
+from stages.perception.rendering.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats, Mesh
 
 Costs = Callable[[Floats], Floats]
@@ -84,7 +84,7 @@ def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def pyrender_loop(task: Task) -> Costs:
     """OpenGL draws one particle after the other, NumPy weighs its depth image."""
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    from stages.perception.renderer import pyrender
+    from stages.perception.rendering.renderer import pyrender
 
     view = task.window.view
     scene: Any = pyrender.Scene()

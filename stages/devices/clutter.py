@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from stages.devices.bop import TARGETS
 from stages.devices.drops import Thing, settle, things
+from stages.geometry.poses import inverse
 from stages.messages.arrays import Depth, Rgb
-from stages.perception.contact_sheet import looking_at
-from stages.perception.depth_noise import StructuredLight, color_noise, structured_light
-from stages.perception.poses import inverse
-from stages.perception.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.perception.training_images import random_texture
+from stages.perception.detection.trained.training_images import random_texture
+from stages.perception.rendering.contact_sheet import looking_at
+from stages.perception.rendering.depth_noise import StructuredLight, color_noise, structured_light
+from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Mesh
 
 SIZE = 640, 480

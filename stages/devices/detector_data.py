@@ -13,10 +13,10 @@ from stages.devices.drops import distractors, random_layout, things
 from stages.devices.simulated_camera import K, SimulatedCamera
 from stages.devices.tabletop import GOALS, sample_goal, sample_start
 from stages.messages import Snapshot
-from stages.perception.depth_noise import color_noise
-from stages.perception.detection_network import HEIGHT, WIDTH, fit
-from stages.perception.renderer import Camera, Item, Renderer
-from stages.perception.training_images import Example, labelled, render_example, save_examples
+from stages.perception.detection.trained.network import HEIGHT, WIDTH, fit
+from stages.perception.detection.trained.training_images import Example, labelled, render_example, save_examples
+from stages.perception.rendering.depth_noise import color_noise
+from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import BUILT_IN, Catalogue, Floats
 
 

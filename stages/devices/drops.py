@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stages.perception.training_images import DISTRACTOR, Body, Layout
+from stages.perception.detection.trained.training_images import DISTRACTOR, Body, Layout
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Mesh, Primitive
 
 _TIMESTEP = 0.004

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from runner.contract import Refused
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.planning.robot import Gripper, RobotModel
 from stages.scene.catalogue import Floats, Mesh
 

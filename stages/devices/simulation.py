@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from stages.devices import fetch, tabletop
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.planning.collision import add_primitives, add_table, quaternion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.devices import fetch
-from stages.perception.poses import inverse, pose
+from stages.geometry.poses import inverse, pose
 from stages.planning.collision import Table
 from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Primitive
 

@@ -1,1 +1,1 @@
-"""Camera model, rendering, likelihood, particle filter, detection network and symmetry."""
+"""From a frame to a scene: detection, hypotheses, the particle filter, refinement, and how sure the result is."""

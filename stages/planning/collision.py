@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.planning.robot import RobotModel
 from stages.scene.catalogue import CatalogueObject, Floats, Primitive
 

@@ -16,7 +16,7 @@ import ompl.base as ob
 import ompl.geometric as og
 import ompl.util as ou
 
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld, quaternion
 from stages.planning.robot import RobotModel
 from stages.scene.catalogue import Floats

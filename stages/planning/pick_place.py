@@ -9,8 +9,8 @@ from itertools import islice, product
 
 import numpy as np
 
+from stages.geometry.poses import inverse
 from stages.messages.task import FailedStage
-from stages.perception.poses import inverse
 from stages.planning.collision import CollisionWorld
 from stages.planning.grasps import HandPose, distinct_grasps, hand_poses
 from stages.planning.motion import free_motion, restarts, solve_ik, straight_motion

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stages.scene.catalogue import Floats
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 
 _HEIGHTS = np.array([0.1, 0.5, 0.9])
 """Shares of an object's height at which its outline is looked at."""

@@ -9,14 +9,14 @@ from itertools import islice
 import numpy as np
 
 from runner.contract import Refused
-from stages.perception.poses import inverse
+from stages.geometry import regions
+from stages.geometry.poses import inverse
 from stages.planning.placements import Placement, Placements, Scene
 from stages.planning.problem import TABLE
 from stages.planning.search import Step
 from stages.planning.sight import hidden_share
-from stages.scene import regions
 from stages.scene.catalogue import Floats, Grasp
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 
 TOUCHING = 0.002
 """Objects whose heights overlap by less than this are above each other, metres."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.geometry.poses import inverse
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.task import FailedStage
-from stages.perception.poses import inverse
 from stages.planning.collision import CollisionWorld, Table
 from stages.planning.motion import free_motion, straight_motion, time_parameterise
 from stages.planning.pick_place import HOVER, LIFT, RELEASE, ROOM, Errand, PickPlace, PickPlacePlanner, opening, raised

@@ -1,1 +1,1 @@
-"""The object catalogue, meshes, relations and virtual objects."""
+"""What stands where: the objects, how they stand to each other, and how that compares with the truth."""

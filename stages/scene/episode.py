@@ -9,7 +9,7 @@ from statistics import median
 from textwrap import fill
 
 from stages.messages import Assertion, Outcome, Plan, SceneGraph, Verdict
-from stages.perception.scoring import ObjectError
+from stages.scene.scoring import ObjectError
 from stages.scene.text import tree
 from stages.scene.truth import Judgement
 

@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from stages.geometry import regions
 from stages.messages.scene import Assertion
-from stages.scene import regions
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 
 TABLE = "table"
 

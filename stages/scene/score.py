@@ -11,8 +11,8 @@ import numpy as np
 
 from runner.contract import Message
 from stages.messages import Goal, SceneGraph, Snapshot
-from stages.perception.scoring import ObjectError, errors
 from stages.scene.catalogue import Catalogue
+from stages.scene.scoring import ObjectError, errors
 from stages.scene.virtual import satisfied
 
 

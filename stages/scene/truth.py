@@ -10,13 +10,13 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from stages.geometry.poses import inverse
 from stages.messages import Assertion, Goal, Outcome, SceneGraph, Snapshot, Verdict, VirtualObject
 from stages.messages.scene import SceneObject
-from stages.perception.poses import inverse
-from stages.perception.scoring import label_of
 from stages.scene.catalogue import Catalogue, Floats
 from stages.scene.relations import Tolerances, assertions, supports
-from stages.scene.standing import Stances, standing_of
+from stages.scene.scoring import label_of
+from stages.scene.stance import Stances, standing_of
 from stages.scene.virtual import satisfied
 
 _BELOW = 0.02

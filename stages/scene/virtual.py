@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry import regions
+from stages.geometry.poses import inverse
 from stages.messages.scene import Assertion, SceneGraph, VirtualObject
-from stages.perception.poses import inverse
-from stages.scene import regions
 from stages.scene.catalogue import Catalogue, Symmetries
 from stages.scene.relations import Support
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 
 Floats = NDArray[np.float64]
 

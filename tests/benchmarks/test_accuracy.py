@@ -12,7 +12,7 @@ from benchmarks.accuracy import interval, read_views, recalls, score
 from benchmarks.common.datasets import read_truth
 from stages.devices.bop_results import HEADER, Result
 from stages.devices.clutter import write_clutter
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.scenes import CATALOGUE
 

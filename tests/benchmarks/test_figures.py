@@ -14,7 +14,7 @@ from benchmarks.common.datasets import Truth, read_truth
 from runner.contract import Refused
 from stages.devices.bop_results import HEADER, Result
 from stages.devices.clutter import write_clutter
-from stages.perception.poses import exp_so3, pose
+from stages.geometry.poses import exp_so3, pose
 from tests.stages.perception.scenes import CATALOGUE
 
 TURN = pose(exp_so3(np.array([0.0, np.deg2rad(40), 0.0])), np.array([0.0, 0.0, 0.03]))

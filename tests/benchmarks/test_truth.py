@@ -11,7 +11,7 @@ from benchmarks.common.datasets import detections_file, images
 from benchmarks.truth import comparisons, line, summary
 from stages.devices.bop_results import Result
 from stages.devices.clutter import write_clutter
-from stages.perception.poses import exp_so3, pose
+from stages.geometry.poses import exp_so3, pose
 from tests.stages.perception.scenes import CATALOGUE
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.geometry.regions import moved
 from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose
 from stages.scene.catalogue import Catalogue, Floats
-from stages.scene.regions import moved
-from stages.scene.standing import Stances, Standing, yawed
+from stages.scene.stance import Stances, Standing, yawed
 from stages.scene_graph import SceneGraphBuilder
 
 CATALOGUE = Path(__file__).parents[2] / "stages" / "scene" / "catalogue.yaml"

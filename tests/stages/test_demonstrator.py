@@ -8,6 +8,7 @@ import pytest
 
 from runner.contract import Message, Refused
 from stages.demonstrator import Demonstrator, change_of_plan
+from stages.geometry.poses import inverse
 from stages.messages import (
     Arrangement,
     Goal,
@@ -22,7 +23,6 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.perception.poses import inverse
 from stages.scene.catalogue import Floats
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout

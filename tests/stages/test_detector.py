@@ -17,8 +17,8 @@ from stages.detector import Detector, ModelDetector, RecordedDetections
 from stages.devices.clutter import write_models
 from stages.devices.detector_data import examples
 from stages.messages import Candidates, Frame
-from stages.perception.detection_evaluation import evaluate
-from stages.perception.detection_network import DetectionNetwork, Detections
+from stages.perception.detection.trained.evaluation import evaluate
+from stages.perception.detection.trained.network import DetectionNetwork, Detections
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.detection.scenes import NAMES, OBJECTS, photograph, views
 

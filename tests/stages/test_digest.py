@@ -17,6 +17,7 @@ from runner.contract import Finished, Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
 from stages.devices.bop_results import Result, read_results
+from stages.geometry.poses import exp_so3, pose
 from stages.hypotheses import Hypotheses
 from stages.messages import (
     Candidate,
@@ -30,7 +31,6 @@ from stages.messages import (
 )
 from stages.messages.digest import Prospect, Sighting
 from stages.particle_filter import ParticleFilter
-from stages.perception.poses import exp_so3, pose
 from stages.ranker import Ranker
 from stages.results import BopResults
 from stages.scene.catalogue import Catalogue

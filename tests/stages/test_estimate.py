@@ -9,8 +9,8 @@ import pytest
 
 from runner.contract import Context, Refused
 from stages.estimate import Box, EstimatedScene, estimate_scene
+from stages.geometry.poses import inverse
 from stages.messages import Candidate, Candidates, Frame
-from stages.perception.poses import inverse
 from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright
 
 PLACED = {"mug": upright("mug", -0.05, 0.0, 0.6), "tea_box": upright("tea_box", 0.1, 0.06, 0.2)}

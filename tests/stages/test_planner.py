@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from runner.contract import Refused
 from stages.devices import tabletop
+from stages.geometry import regions
+from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
-from stages.perception.poses import inverse
 from stages.planner import Planner
 from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
-from stages.scene import regions
-from stages.scene.standing import Standing, yawed
+from stages.scene.stance import Standing, yawed
 from stages.scene.virtual import satisfied
 from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
+from stages.geometry.poses import exp_so3, pose
 from stages.messages import ObjectPose, Observation, SceneEstimate
-from stages.perception.poses import exp_so3, pose
 from stages.refiner import Refiner
 from tests.stages.episodes import Recorded
 from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright

@@ -48,7 +48,7 @@ from stages.messages import (
 )
 from stages.messages.digest import ParticleTrace
 from stages.messages.scene import Alternative, UnknownRegion
-from stages.perception.renderer import Camera, Item, Renderer
+from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue
 from stages.views import (
     Views,

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.perception.boxes import survivors
 from stages.perception.detection.appearance import Bytes, Mask
+from stages.perception.detection.boxes import survivors
 from stages.perception.detection.merging import Labels, Pieces, components, merged
 from stages.perception.detection.supports import Support, supports
-from stages.perception.rasteriser import Float32s, View
+from stages.perception.rendering.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats
 
 _FARTHEST = 2.5

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.perception.plane import find_plane, height_above, noise
-from stages.perception.rasteriser import Float32s, View
+from stages.perception.observation.plane import find_plane, height_above, noise
+from stages.perception.rendering.rasteriser import Float32s, View
 from stages.scene.catalogue import Floats
 
 Mask = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from benchmarks.clutter import sheet
 from benchmarks.common.datasets import images, truths_by_image
 from stages.devices.bop import read_dataset
 from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, Pile, write_clutter
-from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Catalogue
 
 CATALOGUE = Catalogue.load(Path(__file__).parents[3] / "stages/scene/catalogue.yaml")

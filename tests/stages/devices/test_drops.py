@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.devices.drops import Thing, distractors, random_layout, settle, things
-from stages.perception.training_images import DISTRACTOR
+from stages.perception.detection.trained.training_images import DISTRACTOR
 from stages.scene.catalogue import Catalogue
 
 CATALOGUE = Path(__file__).parents[3] / "stages/scene/catalogue.yaml"

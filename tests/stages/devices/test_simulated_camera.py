@@ -10,8 +10,8 @@ import stages.scene
 from stages.devices import fetch
 from stages.devices.simulated_camera import HEIGHT, ROBOT_MARGIN, WIDTH, K, SimulatedCamera, robot_pixels
 from stages.devices.tabletop import TABLE
+from stages.geometry.camera import project, rays
 from stages.messages import Snapshot
-from stages.perception.camera_model import project, rays
 from stages.scene.catalogue import Catalogue, Floats
 
 CATALOGUE = Catalogue.load(Path(stages.scene.__file__).parent / "catalogue.yaml")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from stages.perception.rasteriser import View
+from stages.perception.rendering.rasteriser import View
 from stages.scene.catalogue import Floats, Mesh
 
 # Images this small only lose time to threads, the more the busier the machine.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from stages.perception.colour import surface_normals
-from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.perception.refinement.colour import surface_normals
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Floats, Mesh
 
 LIGHT = np.array([0.3, -0.5, -0.8])

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.perception.likelihood import ObservedScene
-from stages.perception.poses import exp_so3, pose
-from stages.perception.rasteriser import Soup, View, inverse_depth
+from stages.geometry.poses import exp_so3, pose
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Catalogue, Floats
 
 CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"

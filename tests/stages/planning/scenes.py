@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.devices import fetch, tabletop
-from stages.perception.poses import pose
+from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld
 from stages.scene.catalogue import Catalogue, Floats
 

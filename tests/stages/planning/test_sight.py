@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.geometry import regions
 from stages.planning.sight import hidden_share
-from stages.scene import regions
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, stances
 
 EYE = np.array([-0.6, 0.0, 0.4])

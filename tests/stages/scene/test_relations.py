@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.scene.standing import Standing
+from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, stances
 
 SCENES = {

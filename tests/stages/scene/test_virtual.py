@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.messages import SceneGraph
-from stages.scene.standing import yawed
+from stages.scene.stance import yawed
 from stages.scene.virtual import satisfied
 from tests.stages.layouts import Layout, asserted, breakfast, catalogue
 

@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 
 from stages.messages import Frame
-from stages.perception.contact_sheet import looking_at
 from stages.perception.detection.views import Views
-from stages.perception.rasteriser import Float32s, View
-from stages.perception.renderer import Camera, Item, Renderer
+from stages.perception.rendering.contact_sheet import looking_at
+from stages.perception.rendering.rasteriser import Float32s, View
+from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue, Floats, Mesh
 from tests.stages.perception.scenes import CATALOGUE, upright
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.perception.boxes import intersection_over_union
+from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.propose import Proposals, Proposer
 from tests.stages.perception.detection.scenes import NAMES, K, Photograph, photograph, views
 

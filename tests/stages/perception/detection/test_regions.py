@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.perception.boxes import intersection_over_union
+from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.regions import Region, regions
 from stages.perception.detection.supports import supports
 from stages.scene.catalogue import Floats

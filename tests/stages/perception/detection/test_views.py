@@ -10,7 +10,7 @@ from runner.contract import Refused
 from stages.perception.detection import learn
 from stages.perception.detection.views import Views
 from stages.scene.catalogue import Catalogue
-from stages.scene.geometry import resting_rotations
+from stages.scene.catalogue.mesh_shape import resting_rotations
 from tests.stages.perception.detection.scenes import NAMES, OBJECTS, views
 
 

@@ -1,0 +1,1 @@
+"""Arrays of numbers, rotations and poses, regions of a plane, the pinhole camera."""

@@ -1,0 +1,93 @@
+"""What is remembered of a scene: what is not seen stays where it was last seen or placed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from stages.geometry import regions
+from stages.geometry.poses import inverse
+from stages.messages import Observation, SceneGraph
+from stages.messages.scene import SceneObject
+from stages.perception.confidence.unexplained import is_contradicted, looked_through
+from stages.perception.filter.likelihood import ObservedScene, Shape
+from stages.perception.rendering.rasteriser import Float32s, inverse_depth
+from stages.scene import relations
+from stages.scene.catalogue import Catalogue
+from stages.scene.stance import Stances, standing_of
+
+_TRIANGLES = 500
+_CONTENT = 0.5
+"""Share of a container's footprint up to which something may stand in it."""
+
+
+class Memory:
+    """Completes scenes with what was known before.
+
+    A place counts as empty where the camera looks through what would stand there, other objects apart: the same test
+    by which an estimate is contradicted. What is hidden, or shows without being recognised, stays.
+    """
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
+
+    def complete(self, scene: SceneGraph, known: Mapping[str, SceneObject], observation: Observation) -> SceneGraph:
+        """The scene with those ``known`` objects that it lacks and that may still be where they were.
+
+        A stranger at such an object's place is the object, taken for something else because little of it shows.
+        """
+        seen = {item.name for item in scene.objects}
+        missing = [item for name, item in known.items() if name not in seen]
+        if not missing or observation.T_base_camera is None:
+            return scene
+        strangers = [item for item in scene.objects if item.name not in known]
+        kept, taken = list[SceneObject](), set[str]()
+        for item in missing:
+            false = {stranger.name for stranger in strangers if self._overlap(item, stranger, scene)}
+            others = [other for other in scene.objects if other.name not in false]
+            if not self._seen_empty(item, others, observation):
+                kept.append(item)
+                taken |= false
+        if not kept:
+            return scene
+        return self._related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
+
+    def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
+        view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+        layers = [self._layer(other, view, observation) for other in others]
+        nearest = np.maximum.reduce([view.plane_inverse, *layers])
+        return is_contradicted(looked_through(view, self._layer(item, view, observation), nearest))
+
+    def _layer(self, item: SceneObject, view: ObservedScene, observation: Observation) -> Float32s:
+        assert observation.T_base_camera is not None
+        entry = self._catalogue[item.label]
+        shape = entry.once("remembered", lambda: Shape.of(entry.simplified(_TRIANGLES)))
+        return inverse_depth(shape.soup, inverse(observation.T_base_camera) @ item.T_base_object, view.view)
+
+    def _overlap(self, item: SceneObject, stranger: SceneObject, scene: SceneGraph) -> bool:
+        """Whether not both can stand there; what is small beside a container may be in it."""
+        a, b = standing_of((item, stranger), self._stances, scene.T_base_table)
+        if a.stance.holds and regions.area(b.outline) < _CONTENT * regions.area(a.outline):
+            return False
+        level = a.z_bottom < b.z_top and b.z_bottom < a.z_top
+        return level and regions.separation(a.outline, b.outline) < 0
+
+    def _related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
+        """The same scene with other objects: what carries what is found anew, regions stay where both objects do."""
+        names = {item.name for item in objects}
+        near = tuple(item for item in scene.virtual_objects if {item.parent, item.child} <= names)
+        beside = {item.name for item in near}
+        standing = standing_of(objects, self._stances, scene.T_base_table)
+        carried = relations.supports(standing, relations.Tolerances())
+        return msgspec.structs.replace(
+            scene,
+            objects=tuple(objects),
+            virtual_objects=near,
+            assertions=(
+                *relations.assertions(carried),
+                *(item for item in scene.assertions if not beside.isdisjoint(item.arguments)),
+            ),
+        )

@@ -1,0 +1,136 @@
+"""What the estimated scene leaves open: readings that no object explains, surfaces that the camera looks through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.poses import rotate
+from stages.perception.filter.likelihood import ObservedScene
+from stages.perception.rendering.rasteriser import Float32s
+from stages.scene.catalogue import Floats
+
+Mask = NDArray[np.bool_]
+
+_MARGIN = 0.012
+"""Metres along the ray, at one metre, that no reading of a well-placed surface is off; grows with the square of depth
+as the noise of triangulation does."""
+_EDGE = 5
+"""Pixels about a silhouette (at 640 pixels across) in which a reading may belong to either side."""
+_HEIGHT = 0.015
+"""Metres above the plane, at one metre, below which a reading may be the plane's own; grows likewise."""
+_TOP = 0.025
+"""Metres above the plane that a region reaches at least: a sensor's bias bends the plane it sees."""
+_AREA = 4e-4
+"""Square metres facing the camera that a region has at least: 2 cm by 2 cm."""
+_POINTS = 40
+"""Readings that a region has at least."""
+_CONTRADICTED = 0.3
+"""Share of an object's visible silhouette that the camera looks through if the object cannot be there."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Connected readings above the plane that no object explains."""
+
+    box: Floats
+    """x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""
+    points: int
+    centre_table: Floats
+    """Centre of the readings' enclosing box in the table's frame, metres."""
+    extent_table: Floats
+    """Edges of that box, metres."""
+
+
+def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[Region, ...]:
+    """Clusters what stands on the plane and belongs to no object, the largest first.
+
+    ``layers`` are the objects' inverse depths, H x W each. Readings within a few pixels of a silhouette do not count:
+    there they may be of either side, or of neither.
+    """
+    lonely = _opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
+    count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
+    found = [_region(scene, labels == number) for number in range(1, count)]
+    # How components are numbered may depend on the number of threads; their order here must not.
+    return tuple(sorted(filter(None, found), key=lambda region: (-region.points, *region.box.tolist())))
+
+
+def looked_through(scene: ObservedScene, layer: Float32s, others: Float32s) -> float:
+    """Share of an object's visible silhouette, its rim apart, where the reading is clearly behind its surface.
+
+    ``layer`` and ``others`` are H x W inverse depths of the object, and of the plane and all other objects. 0 where
+    there are no readings: no evidence.
+    """
+    inner = _eroded(layer > 0, max(1, _edge(scene) // 2))
+    seen = inner & (layer >= others) & (scene.factor > 0)
+    behind = scene.depth - 1.0 / np.where(seen, layer, 1.0)
+    through = seen & (behind > _margin(scene))
+    return float(through.sum() / max(1, seen.sum()))
+
+
+def is_contradicted(share: float) -> bool:
+    """Whether an object that the camera looks through by this share of it cannot be there."""
+    return share > _CONTRADICTED
+
+
+def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
+    """Readings above the plane away from every surface and every silhouette."""
+    normal, offset = scene.plane[:3], scene.plane[3]
+    above = ((scene.view.rays() * normal).sum(-1) * scene.depth + offset) > _HEIGHT * _growth(scene)
+    open_readings = scene.foreground & above
+    margin = _margin(scene)
+    for layer in layers:
+        shown = layer > 0
+        on_it = shown & (np.abs(1.0 / np.where(shown, layer, 1.0) - scene.depth) < margin)
+        rim = _dilated(shown, _edge(scene)) & ~_eroded(shown, _edge(scene))
+        open_readings &= ~(on_it | rim)
+    return open_readings
+
+
+def _region(scene: ObservedScene, mask: Mask) -> Region | None:
+    rows, columns = np.nonzero(mask)
+    z = scene.depth[rows, columns].astype(np.float64)
+    if len(rows) < _POINTS or float((z**2).sum()) / (scene.view.fx * scene.view.fy) < _AREA:
+        return None
+    T = scene.T_camera_table
+    points = scene.view.rays()[rows, columns] * z[:, None] - T[:3, 3]
+    low, high = np.percentile(rotate(T[:3, :3].T, points), [2, 98], axis=0)
+    if high[2] < _TOP:
+        return None
+    box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
+    return Region(box, len(rows), (low + high) / 2, high - low)
+
+
+def _margin(scene: ObservedScene) -> Floats:
+    return _MARGIN * _growth(scene)
+
+
+def _growth(scene: ObservedScene) -> Floats:
+    """How much larger a sensor's errors are than at one metre or less, H x W."""
+    return np.maximum(scene.depth.astype(np.float64), 1.0) ** 2
+
+
+def _edge(scene: ObservedScene) -> int:
+    return max(2, round(_EDGE * scene.view.width / 640))
+
+
+def _eroded(mask: Mask, radius: int) -> Mask:
+    return cv2.erode(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
+
+
+def _dilated(mask: Mask, radius: int) -> Mask:
+    return cv2.dilate(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
+
+
+def _opened(mask: Mask, radius: int) -> Mask:
+    """The mask without parts thinner than a disc; single missing readings do not tear it."""
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(1))
+    return cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(radius)).astype(bool) & mask
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)

@@ -1,0 +1,1 @@
+"""The trained detector: its network, the images it learns from, training and evaluation."""

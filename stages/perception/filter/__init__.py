@@ -1,0 +1,1 @@
+"""One object's pose: likelihood, first guesses, the schedule and the particle filter."""

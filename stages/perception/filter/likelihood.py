@@ -1,0 +1,263 @@
+"""Likelihood of one object's pose given everything else in the image (paper, equations 8 and 9).
+
+Rendered and observed point of a pixel lie on one ray, so their distance is |z_R - z_O| times the length of the ray
+with unit depth, a factor known in advance. The cost of a pose is the cost of the background (support plane and
+objects estimated before) plus, over the pixels where the object is in front of that background, what the object
+costs there less what the background had cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from stages.perception.cuda.device import Device, cuda_evaluator
+from stages.perception.rendering.kernels import change_of_cost, evidence, gauss_newton
+from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
+from stages.scene.catalogue import Floats, Mesh
+
+_STRAY = 4.0
+"""A centre one apparent diameter outside costs so many times what the window costs without the object."""
+_SLACK = 0.1
+"""Apparent diameters that a detector's box may be off by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostForm:
+    """What a pixel costs where the object is visible; distances in metres.
+
+    * No reading: nothing. Invalid depth is not evidence.
+    * A reading more than ``occluder_margin`` in front of the rendered surface: something unknown hides the object.
+      The pixel stays as unexplained as it was and costs ``occluder_cost`` besides.
+    * Otherwise the distance between the two points, at most ``truncation``.
+
+    ``plain`` is the paper's plain sum: a pixel is worth explaining by all that the background misses it by.
+    """
+
+    truncation: float = 0.03
+    occluder_margin: float = 0.03
+    occluder_cost: float = 0.004
+    contact_slack: float = 0.015
+    """How far an object may reach below the plane before that costs: a sensor's bias lifts the plane it sees."""
+    plain: bool = False
+
+    @staticmethod
+    def paper() -> CostForm:
+        """Equation 9 as it stands: unbounded, no occluders, no contact."""
+        return CostForm(truncation=100.0, occluder_margin=100.0, occluder_cost=0.0, contact_slack=100.0, plain=True)
+
+    def truncated(self, truncation: float) -> CostForm:
+        """The same form with a tighter bound; what is measured against the bound shrinks with it."""
+        share = truncation / self.truncation
+        return replace(
+            self,
+            truncation=truncation,
+            occluder_margin=self.occluder_margin * share,
+            occluder_cost=self.occluder_cost * share,
+        )
+
+
+@dataclass(frozen=True)
+class ObservedScene:
+    """A depth image made ready: H x W arrays at full resolution."""
+
+    view: View
+    depth: Float32s
+    """Metres, 0 where there is no reading."""
+    factor: Float32s
+    """Length of the pixel's ray with unit depth; 0 where there is no reading."""
+    foreground: NDArray[np.bool_]
+    plane_inverse: Float32s
+    """1/z of the support plane, 0 above its horizon."""
+    T_camera_table: Floats
+
+    @staticmethod
+    def of(depth: Float32s, foreground: NDArray[np.bool_], K: Floats, T_camera_table: Floats) -> ObservedScene:
+        """Prepares an observation (metres, 0 invalid; intrinsics in pixels)."""
+        height, width = depth.shape
+        view = View.of(K, width, height)
+        rays = view.rays()
+        normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
+        inverse = (rays * normal).sum(-1) / (normal * origin).sum()
+        factor = np.sqrt((rays**2).sum(-1)) * (depth > 0)
+        return ObservedScene(
+            view,
+            np.ascontiguousarray(depth, np.float32),
+            factor.astype(np.float32),
+            foreground & (depth > 0),
+            np.maximum(inverse, 0.0).astype(np.float32),
+            np.asarray(T_camera_table, float),
+        )
+
+    @property
+    def plane(self) -> Float32s:
+        """Unit normal and offset: n . p + offset is a point's height above the plane, metres."""
+        normal = self.T_camera_table[:3, 2]
+        return np.append(normal, -(normal * self.T_camera_table[:3, 3]).sum()).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh at one level of detail, ready for the kernel."""
+
+    soup: Soup
+    support: Float32s
+    """S x 3 vertices of the convex hull: one of them is the lowest point, whatever the orientation."""
+    centre: Floats
+    """Middle of the enclosing box, object frame, metres."""
+    diameter: float
+    """Diagonal of the enclosing box, metres."""
+
+    @staticmethod
+    def of(mesh: Mesh) -> Shape:
+        """Prepares a mesh."""
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        hull = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+        return Shape(
+            Soup.of(mesh), hull.astype(np.float32), (low + high) / 2, float(np.sqrt(((high - low) ** 2).sum()))
+        )
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a scene that one object's filter looks at, every ``stride``-th pixel of it."""
+
+    view: View
+    inverse_background: Float32s
+    observed: Float32s
+    factor: Float32s
+    credit: Float32s
+    """What the background costs where the object may take credit for explaining it: inside its box."""
+    box: Floats
+    """The candidate's box x0, y0, x1, y1 in pixels of this window."""
+    reach: tuple[float, float]
+    """Smallest and largest depth of what the object may explain, metres, outliers apart."""
+
+    @staticmethod
+    def of(
+        scene: ObservedScene,
+        background: Float32s,
+        box: tuple[int, int, int, int],
+        region: tuple[int, int, int, int],
+        *,
+        stride: int,
+        form: CostForm,
+    ) -> Window:
+        """Cuts ``region`` (x0, y0, x1, y1 pixels, exclusive) out of a scene.
+
+        ``background`` is the H x W inverse depth of everything known; credit is given inside ``box``.
+        """
+        x0, y0, x1, y1 = region
+        part = np.s_[y0:y1:stride, x0:x1:stride]
+        credit = np.zeros((y1 - y0, x1 - x0), np.float32)
+        rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
+        credit[box[1] - y0 : box[3] - y0, box[0] - x0 : box[2] - x0] = credits(scene, background, form, (rows, columns))
+        credit = credit[::stride, ::stride]
+        open_depths = scene.depth[part][credit > 0]
+        low, high = np.percentile(open_depths, [2, 98]) if len(open_depths) else (0.0, np.inf)
+        corner = np.array([x0, y0, x0, y0], float)
+        return Window(
+            scene.view.sampled(*region, stride),
+            *(np.ascontiguousarray(a) for a in (background[part], scene.depth[part], scene.factor[part], credit)),
+            box=(np.array(box, float) - corner) / stride,
+            reach=(float(low), float(high)),
+        )
+
+
+def credits(
+    scene: ObservedScene, background: Float32s, form: CostForm, part: tuple[slice, slice] = np.s_[:, :]
+) -> Float32s:
+    """What each pixel of a part costs with the background alone, metres: what an object gains by explaining it."""
+    inverse, factor = background[part], scene.factor[part]
+    known = inverse > 0
+    behind = 1.0 / np.where(known, inverse, 1.0) - scene.depth[part]
+    miss = np.where(known, factor * behind, form.truncation * (factor > 0))
+    if form.plain:
+        return np.abs(miss).astype(np.float32)
+    # Only readings in front of the background ask for an explanation; the plane's own noise does not.
+    return (np.clip(miss, 0.0, form.truncation) * scene.foreground[part]).astype(np.float32)
+
+
+class ObjectLikelihood:
+    """Costs of poses of one object in one window; owns the kernel's working memory."""
+
+    def __init__(
+        self, shape: Shape, window: Window, scene: ObservedScene, form: CostForm, *, device: Device = "cpu"
+    ) -> None:
+        self.shape = shape
+        self.window = window
+        self.form = form
+        self.plane = scene.plane
+        """Unit normal and offset of the support plane."""
+        self._evidence = evidence(
+            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(), window.credit.ravel(),
+            window.view.numbers,
+        )  # fmt: skip
+        self.base = float(window.credit.sum(dtype=np.float64))
+        """Cost of the window without the object."""
+        self._on_gpu = None if device == "cpu" else cuda_evaluator(self)
+
+    def costs(self, poses: Floats) -> Floats:
+        """d(R, O) of equation 9 in metres times pixels for poses P x 3 x 4 (rows of T_camera_object)."""
+        change = self._on_cpu if self._on_gpu is None else self._on_gpu.changes
+        return self.base + change(poses).astype(np.float64)
+
+    def _on_cpu(self, poses: Floats) -> Float32s:
+        out = np.zeros(len(poses), np.float32)
+        soup, window, form = self.shape.soup, self.window, self.form
+        limits = np.array([form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack], np.float32)
+        change_of_cost(
+            soup.lanes, soup.blocks, soup.corners, self.shape.support, np.ascontiguousarray(poses, np.float32),
+            window.view.numbers, self._evidence, self.plane, limits, out,
+        )  # fmt: skip
+        return out
+
+    def energies(self, poses: Floats) -> Floats:
+        """Costs and what the candidate's box says against a pose, by which particles are weighted, P.
+
+        An object that shows nothing cannot have made the detector see a box. The plain form has no such prior.
+        """
+        costs = self.costs(poses)
+        return costs if self.form.plain else costs + self.base * (_STRAY * self._stray(poses) + (costs == self.base))
+
+    def _stray(self, poses: Floats) -> Floats:
+        """How far each pose's centre is from where the box and its readings allow it, in diameters, P.
+
+        The box touches what is visible of the object on all four sides, and nothing visible is farther from the
+        centre than half a diameter. Without this an object that leaves the window would explain nothing for free.
+        """
+        view, box, (near, far) = self.window.view, self.window.box, self.window.reach
+        centres = (poses[:, :, :3] * self.shape.centre).sum(-1) + poses[:, :, 3]
+        z = np.maximum(centres[:, 2:], 0.05)
+        apparent = self.shape.diameter * view.fx / z
+        at = view.project(np.concatenate([centres[:, :2], z], -1))
+        ends = np.stack([box[2:] - apparent / 2, box[:2] + apparent / 2])
+        outside = np.maximum(ends.min(0) - at, at - ends.max(0)) / apparent - _SLACK
+        half = self.shape.diameter / 2
+        beyond = np.maximum(near - half - z, z - far - half) / self.shape.diameter - _SLACK
+        return np.clip(np.concatenate([outside, beyond], -1), 0.0, 1.0).sum(-1)
+
+    def refine(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
+        """Poses after ``steps`` Gauss-Newton steps of projective point-to-plane ICP, K x 3 x 4.
+
+        ``directions`` are the D twists (rotation about the object's centre, translation; camera frame) in which the
+        object may move, 6 x D. Readings farther than ``gate`` metres from the rendered surface take no part.
+        """
+        if self._on_gpu is not None:
+            return self._on_gpu.refined(poses, directions, steps=steps, gate=gate)
+        moved = np.array(poses, np.float64)
+        soup, window = self.shape.soup, self.window
+        gauss_newton(
+            soup.lanes, soup.blocks, soup.corners, self.shape.centre, moved, steps, gate, window.view.numbers,
+            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
+            np.ascontiguousarray(directions),
+        )  # fmt: skip
+        return moved
+
+
+def with_object(background: Float32s, soup: Soup, T_camera_object: Floats, view: View) -> Float32s:
+    """The inverse depth of a background and one more object, H x W."""
+    return np.maximum(background, inverse_depth(soup, T_camera_object, view))

@@ -1,0 +1,185 @@
+"""Scenes put together from the layers of their objects: what they cost, what they must cost, and which come first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.messages.digest import Glimpse
+from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
+from stages.perception.filter.particle_filter import pixels
+from stages.perception.rendering.rasteriser import Float32s
+from stages.scene.catalogue import Floats
+
+REACH = 0.25
+"""Share of a candidate's box by which it is grown to where its object may explain readings: boxes are not exact."""
+STRIDE = 2
+"""Glimpses keep every second pixel of every second row."""
+
+
+class Composition:
+    """The objects of one hypothesis in one observation, each with the part of the image that it may explain.
+
+    An object takes credit only inside its candidate's grown box; elsewhere it costs what it misses and leaves the
+    readings as unexplained as they were. Readings outside all of the boxes therefore stay unexplained whatever the
+    poses, and their credit is a lower bound of the cost (:meth:`bound`).
+    """
+
+    def __init__(self, scene: ObservedScene, form: CostForm, boxes: Sequence[Floats]) -> None:
+        self.scene = scene
+        self._form = form
+        self._reaches = [_mask(scene, pixels(box, scene, margin=REACH)) for box in boxes]
+        self.credit = credits(scene, scene.plane_inverse, form)
+        """What each pixel costs with the plane alone, H x W metres."""
+
+    def bound(self) -> float:
+        """What every scene of the hypothesis costs at least."""
+        inside = np.logical_or.reduce([np.zeros_like(self.scene.foreground), *self._reaches])
+        return _sum(np.where(inside, 0.0, self.credit))
+
+    def cost(self, layers: Sequence[Float32s]) -> float:
+        """d(R, O) of the scene; layers are H x W inverse depths in the order of the boxes."""
+        return _sum(self.pixels(layers))
+
+    def cost_of_nothing(self) -> float:
+        """The cost without any object."""
+        return _sum(self.credit)
+
+    def cost_without(self, i: int, layers: Sequence[Float32s]) -> float:
+        """The cost of the scene without one of its objects."""
+        return _sum(self.pixels([*layers[:i], *layers[i + 1 :]], self._reaches[:i] + self._reaches[i + 1 :]))
+
+    def pixels(self, layers: Sequence[Float32s], reaches: Sequence[NDArray[np.bool_]] | None = None) -> Float32s:
+        """Cost of every pixel, H x W metres; ``reaches`` are the masks of the layers where these are not all."""
+        nearest = self.scene.plane_inverse
+        allowed = np.ones_like(self.scene.foreground)
+        for layer, reach in zip(layers, self._reaches if reaches is None else reaches, strict=True):
+            nearer = layer > nearest
+            nearest = np.where(nearer, layer, nearest)
+            allowed = np.where(nearer, reach, allowed)
+        return pixel_costs(self.scene, self.credit, nearest, self._form, allowed)
+
+
+def scene_cost(scene: ObservedScene, layers: Sequence[Float32s], form: CostForm) -> float:
+    """d(R, O) of a whole scene, metres times pixels: the same pixels count whatever the hypothesis.
+
+    ``layers`` are the objects' inverse depths, H x W; each may explain any reading. Foreground that no object explains
+    costs what it would cost with the support plane alone.
+    """
+    nearest = np.maximum.reduce([scene.plane_inverse, *layers])
+    return _sum(pixel_costs(scene, credits(scene, scene.plane_inverse, form), nearest, form))
+
+
+def pixel_costs(
+    scene: ObservedScene, credit: Float32s, nearest: Float32s, form: CostForm,
+    allowed: NDArray[np.bool_] | None = None,
+) -> Float32s:  # fmt: skip
+    """Cost of every pixel of a composed scene, H x W metres.
+
+    ``credit`` is what they cost with the plane alone, ``nearest`` the composed inverse depth; where ``allowed`` is
+    false the object in sight leaves the reading unexplained.
+    """
+    shown = (nearest > scene.plane_inverse) & (scene.factor > 0)
+    behind = scene.factor * (1.0 / np.where(shown, nearest, 1.0) - scene.depth)
+    distance = np.minimum(np.abs(behind), form.truncation)
+    explained = distance if allowed is None else np.where(allowed, distance, credit + distance)
+    return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
+
+
+def charge(boxes: Sequence[Floats], rises: Sequence[float], share: float) -> float:
+    """What objects cost by being there, metres times pixels: ``share`` of what their boxes would, were they filled with
+    readings as far from the plane as the objects rise (metres) and nothing explained.
+
+    A box frames what is visible of its object, so the object can explain most of it. One that explains less than its
+    share is not worth having: a double of another, or one that is not there.
+    """
+    areas = [float(box[2] - box[0]) * float(box[3] - box[1]) for box in boxes]
+    return share * sum(area * rise for area, rise in zip(areas, rises, strict=True))
+
+
+def rise(scene: ObservedScene, layer: Float32s, form: CostForm) -> float:
+    """Metres by which an object (H x W inverse depth) stands out of the plane along the rays, bounded, on average.
+
+    What lies flat, as a tray does, cannot explain more of its box than this.
+    """
+    shown = (layer > scene.plane_inverse) & (scene.factor > 0)
+    if not shown.any():
+        return form.truncation
+    plane = np.where(scene.plane_inverse > 0, scene.plane_inverse, np.float32(1e-6))[shown]
+    out = scene.factor[shown] * (1.0 / plane - 1.0 / layer[shown])
+    return float(np.minimum(out, form.truncation).mean(dtype=np.float64))
+
+
+def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:
+    """Mean distance over the pixels that show an object (metres, bounded) and the share of it that nothing hides.
+
+    ``layer`` and ``others`` are H x W inverse depths of the object and of all else.
+    """
+    silhouette = layer > 0
+    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
+    shown = silhouette & ~((layer < others) | (behind > form.occluder_margin))
+    read = shown & (scene.factor > 0)
+    distances = np.minimum(np.abs(behind[read]), form.truncation)
+    cost = float(distances.mean(dtype=np.float64)) if read.any() else form.truncation
+    return cost, float(shown.sum() / max(1, silhouette.sum()))
+
+
+def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
+    """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
+    shown = layer > scene.plane_inverse
+    kept = shown[::STRIDE, ::STRIDE]
+    rows, columns = _extent(kept.sum(1) > 0), _extent(kept.sum(0) > 0)
+    composition = Composition(scene, form, [box])
+    change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
+    part = np.s_[rows.start : rows.stop, columns.start : columns.stop]
+    inverse, change = (np.where(shown, a, 0.0)[::STRIDE, ::STRIDE][part] for a in (layer, change))
+    return Glimpse(
+        left=columns.start,
+        top=rows.start,
+        inverse=np.ascontiguousarray(inverse, np.float32),
+        change=np.ascontiguousarray(change, np.float32),
+    )
+
+
+class FirstLook:
+    """Ranks combinations of candidates by what their objects would cost together where each stands if alone."""
+
+    def __init__(self, glimpses: Sequence[Glimpse], charges: Sequence[float] | None = None) -> None:
+        """``charges`` are what each object costs by being there, metres times pixels."""
+        self._glimpses = glimpses
+        self._charges = charges or [0.0] * len(glimpses)
+        width = max((g.left + g.inverse.shape[1] for g in glimpses), default=0)
+        height = max((g.top + g.inverse.shape[0] for g in glimpses), default=0)
+        self._inverse = np.zeros((height, width), np.float32)
+        self._change = np.zeros_like(self._inverse)
+
+    def cost(self, chosen: Sequence[int]) -> float:
+        """Cost of the composed scene less that of the empty one, metres times pixels at full resolution."""
+        self._inverse[:] = 0.0
+        self._change[:] = 0.0
+        for i in chosen:
+            one = self._glimpses[i]
+            height, width = one.inverse.shape
+            part = np.s_[one.top : one.top + height, one.left : one.left + width]
+            nearer = one.inverse > self._inverse[part]
+            np.copyto(self._inverse[part], one.inverse, where=nearer)
+            np.copyto(self._change[part], one.change, where=nearer)
+        return _sum(self._change) * STRIDE**2 + sum(self._charges[i] for i in chosen)
+
+
+def _extent(kept: NDArray[np.bool_]) -> slice:
+    at = np.flatnonzero(kept)
+    return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 0)
+
+
+def _mask(scene: ObservedScene, rectangle: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    x0, y0, x1, y1 = rectangle
+    inside = np.zeros(scene.depth.shape, bool)
+    inside[y0:y1, x0:x1] = True
+    return inside
+
+
+def _sum(costs: NDArray[np.floating]) -> float:
+    return float(costs.sum(dtype=np.float64))

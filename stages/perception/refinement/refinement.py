@@ -1,0 +1,383 @@
+"""Refines the winning scene: every object polished against all others at full resolution, flips settled by colour.
+
+The filters of the hypotheses look at coarse windows and simplified meshes, one object after the other. What follows
+is done once, for the winner alone, with finer meshes and every pixel. A pose changes only where the cost of the whole
+scene (equation 9) agrees, or where depth cannot tell two poses apart and colour can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.poses import symmetry_angle
+from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.filter.particle_filter import FilterSettings, Rectangle
+from stages.perception.filter.proposals import Dof, Proposals
+from stages.perception.hypotheses.composition import fit, scene_cost
+from stages.perception.refinement.colour import Contender, Paint, Verdict, judge
+from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
+from stages.perception.rendering.rasteriser import Float32s, inverse_depth
+from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+
+_GAIN = 5e-6
+"""Metres per visible pixel by which a moved object must lower the scene's cost."""
+_LOYAL = 0.2
+"""Share of what counts as equal by which a flip must be cheaper to be depth's favourite, not the present pose."""
+_SAME = np.deg2rad(12.0)
+"""Two poses closer than this, modulo symmetry, are one."""
+_ROUGH = 3
+_PROMISING = 6
+_HOPE = 6.0
+"""Steps by which all flips are polished first, and how many are polished in full: only those whose cost then exceeds
+the present one's by less than so many times what counts as equal."""
+_YAW_STEP = np.deg2rad(15.0)
+"""Between the turns about a continuous axis at which an object's colours are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSettings:
+    """How the winner is refined."""
+
+    dof: Dof = 6
+    cost: CostForm = field(default_factory=CostForm)
+    triangles: int = 2000
+    """Detail of the meshes."""
+    rounds: int = 3
+    """Times that every object is polished at most, the others fixed; 0 leaves the poses where they are."""
+    steps: int = 6
+    """Gauss-Newton steps of a polish."""
+    gate: float = 0.01
+    """Metres between a reading and the surface beyond which it takes no part in a polish."""
+    contact: bool = True
+    """Penetration and floating cost."""
+    colour: bool = True
+    """Colour decides between poses that depth finds equal."""
+    equal: float = 0.5
+    """Depth finds poses equal whose costs differ by less than this share of the mean distance of the visible pixels
+    at the better one: by less than what the sensor's noise and the mesh's errors leave of any pose."""
+
+    @staticmethod
+    def of(filter_settings: FilterSettings) -> RefinementSettings:
+        """As the filter is set: what is switched off there is switched off here."""
+        chosen = filter_settings
+        rounds = RefinementSettings.rounds if chosen.joint else 0
+        return RefinementSettings(
+            dof=chosen.dof, cost=chosen.cost, rounds=rounds, contact=chosen.contact, colour=chosen.colour
+        )
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object of the scene as it was estimated."""
+
+    label: str
+    T_camera_object: Floats
+    """3 x 4 or 4 x 4."""
+
+
+@dataclass(frozen=True)
+class Considered:
+    """A pose that was compared with its flips, the other objects fixed."""
+
+    T_camera_object: Floats
+    """3 x 4."""
+    depth: float
+    """By how much the scene costs more (metres times pixels, contact included) than at the cheapest pose."""
+    colour: float | None
+    """Mean distance of its colours from the image, CIELAB units; None where colour was not asked or saw too little."""
+
+
+@dataclass(frozen=True)
+class RefinedObject:
+    """One object of the refined scene."""
+
+    label: str
+    T_camera_object: Floats
+    """3 x 4."""
+    layer: Float32s
+    """H x W inverse depth of the object alone."""
+    cost: float
+    """Mean distance over the pixels that show it, metres, bounded."""
+    visible: float
+    """Share of its silhouette that nothing hides."""
+    considered: tuple[Considered, ...]
+    """The poses that depth found equal: the chosen one first, then the others, cheapest first."""
+    penetration: float = 0.0
+    """How deep it and another object reach into each other, metres."""
+    sunk: float = 0.0
+    """How far its lowest point lies below the plane, metres."""
+
+
+@dataclass(frozen=True)
+class RefinedScene:
+    """The winner, refined."""
+
+    objects: tuple[RefinedObject, ...]
+    cost: float
+    """d(R, O) of equation 9 over the whole image, metres times pixels."""
+
+
+class SceneRefiner:
+    """Refines scenes of one catalogue's objects."""
+
+    def __init__(self, catalogue: Catalogue, settings: RefinementSettings) -> None:
+        self._catalogue = catalogue
+        self._settings = settings
+        self._models: dict[str, _Model] = {}
+
+    def warm_up(self) -> None:
+        """Lays out every object and compiles the kernels (or loads them), so that the first image waits for nothing."""
+        for label in self._catalogue.objects:
+            self._model(label).prepare()
+        T_camera_table = np.diag([1.0, -1.0, -1.0, 1.0])
+        T_camera_table[2, 3] = 1.1
+        depth = np.full((48, 64), 1.1, np.float32)
+        K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+        scene = ObservedScene.of(depth, depth > 2, K, T_camera_table)
+        placed = [Placed(next(iter(self._catalogue.objects)), T_camera_table)] * 2
+        self.refine(scene, np.zeros((48, 64, 3), np.uint8), placed)
+
+    def refine(self, scene: ObservedScene, rgb: NDArray[np.uint8], placed: Sequence[Placed]) -> RefinedScene:
+        """Polishes all objects together and settles flips; ``rgb`` is H x W x 3, sRGB, registered to the depth."""
+        poses = [np.array(item.T_camera_object[:3], float) for item in placed]
+        joint = _Joint(scene, [self._model(item.label) for item in placed], poses, self._settings)
+        joint.polish()
+        joint.settle(rgb)
+        return joint.result()
+
+    def _model(self, label: str) -> _Model:
+        if label not in self._models:
+            self._models[label] = _Model(self._catalogue[label], self._settings)
+        return self._models[label]
+
+
+class _Model:
+    """What the refiner knows of one catalogue object."""
+
+    def __init__(self, item: CatalogueObject, settings: RefinementSettings) -> None:
+        self.label = item.name
+        self.item = item
+        self.shape = Shape.of(item.simplified(settings.triangles))
+        self.proposals = Proposals.of(item, settings.dof)
+        self.symmetries = item.symmetries.transforms(_YAW_STEP)
+
+    def prepare(self) -> None:
+        """Makes what takes time, but for the paint: few objects are ever asked for their colour."""
+        assert self.solid
+
+    @cached_property
+    def solid(self) -> Solid:
+        """For contacts."""
+        return Solid.of(self.item)
+
+    @cached_property
+    def paint(self) -> Paint:
+        """The full mesh's colours."""
+        return Paint.of(self.item.mesh)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """One object's surroundings while all others stay where they are."""
+
+    region: Rectangle
+    likelihood: ObjectLikelihood
+    directions: Floats
+    visible: float
+    """Pixels that show the object."""
+    equal: float
+    """Costs that differ by less are equal, metres times pixels."""
+
+
+class _Joint:
+    """All objects of a scene while they are refined."""
+
+    def __init__(
+        self, scene: ObservedScene, models: list[_Model], poses: list[Floats], settings: RefinementSettings
+    ) -> None:
+        self._scene = scene
+        self._models = models
+        self._poses = poses
+        self._settings = settings
+        self._layers = [self._layer(i) for i in range(len(models))]
+        self._considered: list[tuple[Considered, ...]] = [()] * len(models)
+
+    def polish(self) -> None:
+        """Moves one object after the other, the others fixed, until a whole round changes nothing."""
+        stale = set(range(len(self._models)))
+        for _ in range(self._settings.rounds):
+            moved = {i for i in sorted(stale) if self._polish(i)}
+            stale = {j for i in moved for j in range(len(self._models)) if self._touches(i, j)}
+
+    def settle(self, rgb: NDArray[np.uint8]) -> None:
+        """Chooses between each object's flips, by depth and then by colour, and polishes again if any turned."""
+        turned = [self._settle(i, rgb) for i in range(len(self._models))]
+        if any(turned):
+            self.polish()
+
+    def result(self) -> RefinedScene:
+        """The scene as it stands."""
+        touching = contacts([model.solid for model in self._models], np.reshape(self._poses, (-1, 3, 4)),
+                            self._scene.T_camera_table)  # fmt: skip
+        found = tuple(self._found(i, touching) for i in range(len(self._models)))
+        return RefinedScene(found, scene_cost(self._scene, self._layers, self._settings.cost))
+
+    def _polish(self, i: int) -> bool:
+        place, start = self._place(i), self._poses[i][None]
+        moved = place.likelihood.refine(start, place.directions, steps=self._settings.steps, gate=self._settings.gate)
+        before, after = self._totals(i, place, np.concatenate([start, moved])).tolist()
+        better = after < before - _GAIN * place.visible
+        if better:
+            self._move(i, moved[0])
+        return better
+
+    def _settle(self, i: int, rgb: NDArray[np.uint8]) -> bool:
+        place = self._place(i)
+        poses, totals = self._equals(i, place)
+        verdict = self._verdict(i, place, poses, rgb) if len(poses) > 1 else None
+        winner = 0 if verdict is None else verdict.winner
+        self._considered[i] = _considered(poses, totals, verdict, winner)
+        turned = not np.array_equal(poses[winner], self._poses[i])
+        if turned:
+            self._move(i, poses[winner])
+        return turned
+
+    def _equals(self, i: int, place: _Place) -> tuple[Floats, Floats]:
+        """Depth's favourite, then the poses that depth finds equal to it, cheapest first, and what they cost.
+
+        They are the present pose and its polished flips, no two the same modulo the object's symmetries. The present
+        one is the favourite unless another is cheaper by a fifth of what counts as equal.
+        """
+        flips = self._flips(i, place)
+        present = self._totals(i, place, self._poses[i][None])
+        flips = flips[place.likelihood.costs(flips) <= present[0] + place.equal]
+        poses = np.concatenate([self._poses[i][None], flips])
+        totals = np.concatenate([present, self._totals(i, place, flips)])
+        ranks = totals - _LOYAL * place.equal * (np.arange(len(totals)) == 0)
+        kept = _distinct(poses, ranks, self._models[i].item.symmetries.transforms())
+        kept = [k for k in kept if totals[k] <= totals.min() + place.equal]
+        return poses[kept], totals[kept]
+
+    def _flips(self, i: int, place: _Place) -> Floats:
+        """Those of the object's flips that are worth a full polish, polished."""
+        settings = self._settings
+        flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
+        rough = place.likelihood.refine(flips, place.directions, steps=_ROUGH, gate=2 * settings.gate)
+        present, *costs = place.likelihood.costs(np.concatenate([self._poses[i][None], rough])).tolist()
+        order = np.argsort(costs, kind="stable")[:_PROMISING]
+        promising = rough[[k for k in order.tolist() if costs[k] < present + _HOPE * place.equal]]
+        return place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
+
+    def _verdict(self, i: int, place: _Place, poses: Floats, rgb: NDArray[np.uint8]) -> Verdict | None:
+        if not self._settings.colour:
+            return None
+        x0, y0, x1, y1 = place.region
+        window, model = place.likelihood.window, self._models[i]
+        layers = [inverse_depth(model.shape.soup, pose, window.view) for pose in poses]
+        visible = np.logical_and.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
+        contenders = [Contender(*each) for each in zip(poses, layers, strict=True)]
+        return judge(
+            rgb[y0:y1, x0:x1], window.view, visible, contenders,
+            paint=model.paint, symmetries=model.symmetries,
+        )  # fmt: skip
+
+    def _place(self, i: int) -> _Place:
+        """Costs of poses of one object about where it is, with all others fixed, at full resolution.
+
+        Credit is given everywhere, so that costs differ by as much as the scene's.
+        """
+        x0, y0, x1, y1 = region = _around(self._models[i].shape, self._poses[i], self._scene)
+        scene = _cropped(self._scene, region)
+        others = [layer[y0:y1, x0:x1] for j, layer in enumerate(self._layers) if j != i]
+        background = np.maximum.reduce([scene.plane_inverse, *others])
+        everything = (0, 0, x1 - x0, y1 - y0)
+        window = Window.of(scene, background, everything, everything, stride=1, form=self._settings.cost)
+        likelihood = ObjectLikelihood(self._models[i].shape, window, scene, self._settings.cost)
+        layer = self._layers[i][y0:y1, x0:x1]
+        cost, share = fit(scene, layer, background, self._settings.cost)
+        visible = float(share * (layer > 0).sum())
+        directions = self._models[i].proposals.directions(scene.T_camera_table)
+        return _Place(region, likelihood, directions, visible, self._settings.equal * cost * visible)
+
+    def _totals(self, i: int, place: _Place, poses: Floats) -> Floats:
+        """What the scene costs with the object at each of the poses, up to a constant: depth and contact."""
+        return place.likelihood.costs(poses) + np.array([self._penalty(i, pose) for pose in poses])
+
+    def _penalty(self, i: int, pose: Floats) -> float:
+        if not self._settings.contact:
+            return 0.0
+        solids = [model.solid for model in self._models]
+        poses = np.stack([*self._poses[:i], pose, *self._poses[i + 1 :]])
+        found = contacts(solids, poses, self._scene.T_camera_table)
+        return penalty(found, apparent(solids, poses, self._scene.view.fx))
+
+    def _found(self, i: int, touching: Contacts) -> RefinedObject:
+        others = [self._scene.plane_inverse, *(layer for j, layer in enumerate(self._layers) if j != i)]
+        cost, visible = fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
+        return RefinedObject(
+            self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i],
+            penetration=float(touching.penetration[i].max()), sunk=float(touching.sunk[i]),
+        )  # fmt: skip
+
+    def _move(self, i: int, pose: Floats) -> None:
+        self._poses[i] = pose
+        self._layers[i] = self._layer(i)
+
+    def _layer(self, i: int) -> Float32s:
+        return inverse_depth(self._models[i].shape.soup, self._poses[i], self._scene.view)
+
+    def _touches(self, i: int, j: int) -> bool:
+        """Whether another object stands near enough for its pose to depend on this one's."""
+        a, b = (_around(self._models[k].shape, self._poses[k], self._scene) for k in (i, j))
+        return i != j and a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _distinct(poses: Floats, ranks: Floats, symmetries: Floats) -> list[int]:
+    """The poses by rank, without those that equal one before modulo symmetry."""
+    kept: list[int] = []
+    for k in np.argsort(ranks, kind="stable").tolist():
+        if all(symmetry_angle(poses[j, :, :3], poses[k, :, :3], symmetries) > _SAME for j in kept):
+            kept.append(k)
+    return kept
+
+
+def _considered(poses: Floats, totals: Floats, verdict: Verdict | None, winner: int) -> tuple[Considered, ...]:
+    order = [winner, *(k for k in np.argsort(totals, kind="stable").tolist() if k != winner)]
+    colours = [None] * len(poses) if verdict is None else verdict.distances.tolist()
+    return tuple(Considered(poses[k], float(totals[k] - totals.min()), colours[k]) for k in order)
+
+
+def _shown(window: Window, layer: Float32s, form: CostForm) -> NDArray[np.bool_]:
+    """Where an object at a pose can be seen: nothing known and no reading lies in front of it."""
+    behind = window.factor * (1.0 / np.where(layer > 0, layer, 1.0) - window.observed)
+    return (layer > window.inverse_background) & ~(behind > form.occluder_margin)
+
+
+def _around(shape: Shape, pose: Floats, scene: ObservedScene) -> Rectangle:
+    """The part of the image that the object's enclosing sphere may cover, whatever its orientation; never empty."""
+    centre = (pose[:, :3] * shape.centre).sum(-1) + pose[:, 3]
+    z = max(float(centre[2]), 0.1)
+    u, v = scene.view.project(np.array([centre[0], centre[1], z]))
+    reach = 0.55 * shape.diameter / z * scene.view.fx + 8
+    x0, x1 = _span(float(u), reach, scene.view.width)
+    y0, y1 = _span(float(v), reach, scene.view.height)
+    return x0, y0, x1, y1
+
+
+def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
+    first = int(np.clip(np.floor(middle - reach), 0, size - 2))
+    return first, int(np.clip(np.ceil(middle + reach), first + 2, size))
+
+
+def _cropped(scene: ObservedScene, region: Rectangle) -> ObservedScene:
+    x0, y0, x1, y1 = region
+    part = np.s_[y0:y1, x0:x1]
+    return ObservedScene(
+        scene.view.sampled(*region, 1), scene.depth[part], scene.factor[part], scene.foreground[part],
+        scene.plane_inverse[part], scene.T_camera_table,
+    )  # fmt: skip

@@ -1,0 +1,112 @@
+"""Objects that are not seen stay where they were last seen or placed, unless their place is seen empty."""
+
+import numpy as np
+
+from stages.geometry.poses import inverse
+from stages.messages import Observation, SceneGraph
+from stages.messages.scene import SceneObject
+from stages.perception.confidence.memory import Memory
+from stages.scene.catalogue import Floats
+from tests.stages.layouts import T_BASE_TABLE, Layout, asserted
+from tests.stages.perception.scenes import CATALOGUE, K, camera, render, upright
+
+MEMORY = Memory(CATALOGUE)
+CARTON = upright("milk_carton", 0.0, -0.05, 0.0)
+BEHIND = upright("salt_shaker", 0.0, 0.04, 0.0)
+HALF_BEHIND = upright("cup", 0.07, 0.04, 0.0)
+
+
+def graph(placed: dict[str, Floats]) -> SceneGraph:
+    return Layout(placed).graph()
+
+
+def known(placed: dict[str, Floats]) -> dict[str, SceneObject]:
+    return {item.name: item for item in graph(placed).objects}
+
+
+def observation(placed: dict[str, Floats]) -> Observation:
+    scene = render(placed).scene
+    return Observation(
+        depth=scene.depth,
+        rgb=np.zeros((*scene.depth.shape, 3), np.uint8),
+        foreground=scene.foreground,
+        K=K,
+        T_camera_table=scene.T_camera_table,
+        T_base_camera=T_BASE_TABLE @ inverse(camera()),
+    )
+
+
+def completed(seen: dict[str, Floats], before: dict[str, Floats], true: dict[str, Floats]) -> SceneGraph:
+    """The scene that shows ``seen`` of what is truly there, to somebody who knew of ``before``."""
+    return MEMORY.complete(graph(seen), known(before), observation(true))
+
+
+def names(scene: SceneGraph) -> list[str]:
+    return [item.name for item in scene.objects]
+
+
+def test_what_is_hidden_stays_where_it_was() -> None:
+    everything = {"milk_carton": CARTON, "salt_shaker": BEHIND}
+    scene = completed({"milk_carton": CARTON}, everything, everything)
+    assert names(scene) == ["milk_carton", "salt_shaker"]
+    np.testing.assert_allclose(scene.objects[1].T_base_object, T_BASE_TABLE @ BEHIND, atol=1e-9)
+    assert {"exist(salt_shaker)", "on(salt_shaker, table)", "clear(salt_shaker)"} <= asserted(scene)
+
+
+def test_what_shows_half_but_was_not_recognised_stays() -> None:
+    everything = {"milk_carton": CARTON, "cup": HALF_BEHIND}
+    assert names(completed({"milk_carton": CARTON}, everything, everything)) == ["milk_carton", "cup"]
+
+
+def test_what_is_taken_away_from_an_open_place_is_forgotten() -> None:
+    cup = upright("cup", 0.15, -0.1, 0.0)
+    scene = completed({"milk_carton": CARTON}, {"milk_carton": CARTON, "cup": cup}, {"milk_carton": CARTON})
+    assert names(scene) == ["milk_carton"] and asserted(scene) == asserted(graph({"milk_carton": CARTON}))
+
+
+def test_a_half_hidden_place_that_is_empty_is_seen_empty() -> None:
+    before = {"milk_carton": CARTON, "cup": HALF_BEHIND}
+    assert names(completed({"milk_carton": CARTON}, before, {"milk_carton": CARTON})) == ["milk_carton"]
+
+
+def test_what_is_seen_elsewhere_is_there() -> None:
+    moved = {"milk_carton": CARTON, "salt_shaker": upright("salt_shaker", 0.15, -0.1, 0.0)}
+    scene = completed(moved, {"milk_carton": CARTON, "salt_shaker": BEHIND}, moved)
+    assert asserted(scene) == asserted(graph(moved)) and len(scene.objects) == 2
+
+
+def test_what_was_taken_for_a_stranger_is_what_stood_there() -> None:
+    everything = {"milk_carton": CARTON, "cup": HALF_BEHIND}
+    stranger = {"milk_carton": CARTON, "soup_can": upright("soup_can", 0.06, 0.05, 0.0)}
+    scene = completed(stranger, everything, everything)
+    assert names(scene) == ["milk_carton", "cup"]
+    assert not any("soup_can" in text for text in asserted(scene))
+
+
+def test_a_stranger_elsewhere_is_kept() -> None:
+    everything = {"milk_carton": CARTON, "salt_shaker": BEHIND, "tuna_can": upright("tuna_can", 0.15, -0.1, 0.0)}
+    seen = {"milk_carton": CARTON, "tuna_can": everything["tuna_can"]}
+    scene = completed(seen, {"milk_carton": CARTON, "salt_shaker": BEHIND}, everything)
+    assert names(scene) == ["milk_carton", "tuna_can", "salt_shaker"]
+
+
+def test_what_is_in_a_tray_is_no_stranger_to_it() -> None:
+    layout = Layout().put("tray", 0.0, 0.0).put("cup", 0.0, 0.0, on="tray")
+    seen = {"cup": layout.poses["cup"]}
+    scene = completed(seen, {"tray": layout.poses["tray"]}, layout.poses)
+    assert names(scene) == ["cup", "tray"] and "in(cup, tray)" in asserted(scene)
+
+
+def test_relations_include_what_is_remembered() -> None:
+    layout = Layout({"milk_carton": CARTON}).put("tea_box", 0.05, 0.06).put("tuna_can", 0.0, 0.0, on="tea_box")
+    seen = {name: T for name, T in layout.poses.items() if name != "tuna_can"}
+    scene = completed(seen, layout.poses, layout.poses)
+    assert "on(tuna_can, tea_box)" in asserted(scene) and "clear(tea_box)" not in asserted(scene)
+
+
+def test_regions_of_what_is_seen_stay() -> None:
+    pair = {"milk_carton": CARTON, "sugar_box": upright("sugar_box", 0.1, -0.05, 0.0), "salt_shaker": BEHIND}
+    seen = {name: pair[name] for name in ("milk_carton", "sugar_box")}
+    scene = completed(seen, pair, pair)
+    assert {item.name for item in scene.virtual_objects} == {item.name for item in graph(seen).virtual_objects} != set()
+    assert {text for text in asserted(graph(seen)) if "_near_" in text} <= asserted(scene)

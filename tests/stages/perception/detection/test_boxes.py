@@ -1,0 +1,74 @@
+"""Overlap, suppression, offsets and average precision, against values worked out by hand."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.perception.detection.boxes import (
+    apply_offsets,
+    average_precision,
+    encode_offsets,
+    intersection_over_union,
+    match,
+    suppress,
+)
+
+A, B, FAR = [0.0, 0, 10, 10], [5.0, 0, 15, 10], [50.0, 50, 60, 60]
+
+
+def test_overlap_of_two_half_shifted_squares_is_a_third() -> None:
+    overlaps = intersection_over_union(np.array([A, FAR]), np.array([A, B]))
+    np.testing.assert_allclose(overlaps, [[1, 1 / 3], [0, 0]])
+
+
+def test_suppression_keeps_the_better_of_two_and_everything_apart() -> None:
+    boxes, scores = np.array([A, B, FAR]), np.array([0.6, 0.9, 0.2])
+    assert suppress(boxes, scores, 0.3) == [1, 2]
+    assert suppress(boxes, scores, 0.4) == [1, 0, 2]
+
+
+def test_suppression_within_labels_leaves_other_labels_alone() -> None:
+    boxes, scores = np.array([A, A, A]), np.array([0.6, 0.9, 0.2])
+    assert suppress(boxes, scores, 0.5, labels=np.array([0, 1, 0])) == [1, 0]
+
+
+def test_equal_scores_keep_their_order_and_nothing_gives_nothing() -> None:
+    assert suppress(np.array([A, A, FAR]), np.full(3, 0.5), 0.5) == [0, 2]
+    assert suppress(np.zeros((0, 4)), np.zeros(0), 0.5) == []
+
+
+def box_strategy() -> st.SearchStrategy[tuple[float, float, float, float]]:
+    corner, size = st.floats(0, 300), st.floats(4, 200)
+    return st.tuples(corner, corner, size, size).map(lambda b: (b[0], b[1], b[0] + b[2], b[1] + b[3]))
+
+
+@settings(deadline=None)
+@given(box_strategy(), st.floats(0.3, 3), st.floats(0.3, 3), st.floats(-30, 30))
+def test_offsets_take_the_anchor_back_to_its_box(
+    anchor: tuple[float, float, float, float], wider: float, higher: float, shift: float
+) -> None:
+    x0, y0, x1, y1 = anchor
+    box = torch.tensor([[x0 + shift, y0 - shift, x0 + shift + wider * (x1 - x0), y0 - shift + higher * (y1 - y0)]])
+    anchors = torch.tensor([anchor])
+    torch.testing.assert_close(apply_offsets(anchors, encode_offsets(anchors, box)), box, atol=1e-2, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("correct", "positives", "expected"),
+    [([True, True], 2, 1.0), ([True, False, True], 2, (1 + 2 / 3) / 2), ([False], 1, 0.0), ([], 3, 0.0)],
+)
+def test_average_precision_of_short_lists(correct: list[bool], positives: int, expected: float) -> None:
+    scores = -np.arange(len(correct), dtype=float)
+    assert average_precision(scores, np.array(correct, bool), positives) == pytest.approx(expected)
+
+
+def test_average_precision_of_an_absent_label_is_undefined() -> None:
+    assert np.isnan(average_precision(np.array([0.5]), np.array([False]), 0))
+
+
+def test_a_true_box_is_found_once_by_its_best_detection() -> None:
+    detected = np.array([A, A, FAR])
+    assert match(detected, np.array([0.5, 0.9, 0.8]), np.array([A]), 0.5).tolist() == [-1, 0, -1]
+    assert match(detected, np.ones(3), np.zeros((0, 4)), 0.5).tolist() == [-1, -1, -1]

@@ -1,0 +1,122 @@
+"""The joint refinement of a scene, and flips put right by colour."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.geometry.poses import exp_so3, pose, symmetry_angle
+from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
+from stages.scene.catalogue import Catalogue, Floats
+from tests.stages.perception.painted import painted
+from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
+
+PLACED = {"soup_can": upright("soup_can", -0.05, -0.05, 0.4), "tea_box": upright("tea_box", 0.06, 0.06, 0.2)}
+OVER = pose(exp_so3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
+STAYS = np.eye(4)
+NUDGE = pose(exp_so3(np.array([0.02, -0.02, 0.02])), np.array([0.003, -0.002, 0.003]))
+SPIN = CATALOGUE["soup_can"].symmetries.transforms()
+PLAIN = {
+    label: replace(item, mesh=replace(item.mesh, colors=np.full_like(item.mesh.colors, (180, 40, 30))))
+    for label, item in CATALOGUE.objects.items()
+}
+
+
+@pytest.fixture(scope="module")
+def seen() -> Rendered:
+    return render(PLACED)
+
+
+@pytest.fixture(scope="module")
+def refiner() -> SceneRefiner:
+    return SceneRefiner(CATALOGUE, RefinementSettings())
+
+
+def image(seen: Rendered, catalogue: Catalogue = CATALOGUE, *, can: Floats = STAYS) -> np.ndarray:
+    """What a camera would see; the can may be painted as if it stood otherwise than in depth."""
+    poses = seen.poses | {"soup_can": seen.poses["soup_can"] @ can}
+    return painted([(catalogue[label].mesh, T) for label, T in poses.items()], VIEW)
+
+
+def nudged(seen: Rendered, *, can: Floats = NUDGE) -> list[Placed]:
+    return [Placed("soup_can", seen.poses["soup_can"] @ can), Placed("tea_box", seen.poses["tea_box"] @ NUDGE)]
+
+
+def turned(found: RefinedScene, seen: Rendered, catalogue: Catalogue = CATALOGUE) -> list[float]:
+    """Degrees by which each object is turned, modulo symmetry."""
+    return [
+        float(np.rad2deg(symmetry_angle(item.T_camera_object[:, :3], seen.poses[item.label][:3, :3],
+                                        catalogue[item.label].symmetries.transforms())))
+        for item in found.objects
+    ]  # fmt: skip
+
+
+def test_a_can_upside_down_is_put_right(seen: Rendered, refiner: SceneRefiner) -> None:
+    found = refiner.refine(seen.scene, image(seen), nudged(seen, can=OVER))
+    assert max(turned(found, seen)) < 3
+    assert [item.layer.shape for item in found.objects] == [seen.scene.depth.shape] * 2
+
+
+def test_colour_decides_where_depth_finds_poses_equal(seen: Rendered, refiner: SceneRefiner) -> None:
+    can = refiner.refine(seen.scene, image(seen, can=OVER), nudged(seen)).objects[0]
+    assert symmetry_angle(can.T_camera_object[:, :3], (seen.poses["soup_can"] @ OVER)[:3, :3], SPIN) < np.deg2rad(3)
+    chosen, other = can.considered
+    assert chosen.depth > other.depth == 0
+    assert chosen.colour is not None and other.colour is not None and chosen.colour < other.colour
+
+
+@pytest.mark.parametrize("why", ["switched off", "no image", "no colour"])
+def test_without_colour_depth_stands(seen: Rendered, why: str) -> None:
+    catalogue = Catalogue(PLAIN) if why == "no colour" else CATALOGUE
+    rgb = image(seen, catalogue, can=OVER)
+    settings = RefinementSettings(colour=why != "switched off")
+    found = SceneRefiner(catalogue, settings).refine(seen.scene, 0 * rgb if why == "no image" else rgb, nudged(seen))
+    assert turned(found, seen)[0] < 3
+
+
+def test_colour_does_not_overrule_depth(seen: Rendered, refiner: SceneRefiner) -> None:
+    mug = render({"mug": upright("mug", 0.0, 0.0, 0.6)})
+    false = {"mug": mug.poses["mug"] @ pose(exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))}
+    rgb = painted([(CATALOGUE[label].mesh, T) for label, T in false.items()], VIEW)
+    found = refiner.refine(mug.scene, rgb, [Placed("mug", mug.poses["mug"])])
+    assert turned(found, mug)[0] < 3
+
+
+def test_what_is_switched_off_in_the_filter_is_off_here(seen: Rendered) -> None:
+    settings = RefinementSettings.of(FilterSettings().without("joint refinement", "contact"))
+    assert (settings.rounds, settings.contact, settings.colour) == (0, False, FilterSettings().colour)
+
+
+def test_polish_lowers_the_cost_and_comes_closer(seen: Rendered, refiner: SceneRefiner) -> None:
+    placed = [Placed(label, T @ NUDGE) for label, T in seen.poses.items()]
+    still = SceneRefiner(CATALOGUE, RefinementSettings(rounds=0, colour=False))
+    before, after = (r.refine(seen.scene, image(seen), placed) for r in (still, refiner))
+    assert after.cost < before.cost
+    for item in after.objects:
+        assert offset(item.T_camera_object, seen.poses[item.label]) < 0.0015
+
+
+def offset(A: Floats, B: Floats) -> float:
+    return float(np.linalg.norm(A[:3, 3] - B[:3, 3]))
+
+
+def digest() -> str:
+    seen = render({"soup_can": PLACED["soup_can"]})
+    placed = [Placed("soup_can", seen.poses["soup_can"] @ NUDGE)]
+    (can,) = SceneRefiner(CATALOGUE, RefinementSettings()).refine(seen.scene, image(seen, can=OVER), placed).objects
+    colours = repr([each.colour for each in can.considered]).encode()
+    return hashlib.sha256(can.T_camera_object.tobytes() + can.layer.tobytes() + colours).hexdigest()
+
+
+def test_another_process_finds_the_same_bytes() -> None:
+    code = "from tests.stages.perception.refinement.test_refinement import digest; print(digest())"
+    root = Path(__file__).parents[4]
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert run.stdout.strip() == digest()
