@@ -19,9 +19,10 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import ImageId, Truth, read_truth
 from stages.devices.bop import read_dataset
 from stages.devices.bop_results import Result, read_results
+from stages.geometry.arrays import Floats
 from stages.messages.arrays import Depth, Intrinsics
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.metrics import (
     BOP_SHARES,
     BOP_SYMMETRY_STEP,

@@ -25,6 +25,7 @@ from benchmarks.common.datasets import Image, detections_file, images
 from benchmarks.common.pipeline import Estimate
 from benchmarks.estimate import Settings, estimates
 from stages.devices.clutter import Pile, write_clutter
+from stages.geometry.arrays import Floats
 from stages.messages import Hypothesis, Observation, SceneEstimate
 from stages.perception.confidence.doubt import (
     CONSTANTS,
@@ -43,7 +44,7 @@ from stages.perception.confidence.doubt import (
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
 from stages.perception.rendering.depth_noise import StructuredLight
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.metrics import pose_errors
 
 Truths = NDArray[np.bool_]

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from benchmarks.kernel import CATALOGUE, PARTICLES, SCENE, SHAPES, SIZES, _camera, _observed, _Quiet, _upright, problem
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Hypothesis, Observation, Posterior
 from stages.messages.digest import Prospect
 from stages.particle_filter import ParticleFilter
@@ -20,7 +21,7 @@ from stages.perception.filter.evolution import Population, Step
 from stages.perception.filter.likelihood import ObjectLikelihood
 from stages.perception.filter.particle_filter import FilterSettings
 from stages.perception.filter.proposals import Guess, Proposals
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.metrics import pose_errors
 
 ITERATIONS = 200

@@ -17,8 +17,9 @@ from benchmarks.accuracy import Score, described, failed, score
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, detections_file, images
 from stages.devices.bop_results import Result, read_results
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 _TILE = 240
 _CAPTION = 34

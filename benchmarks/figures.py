@@ -18,7 +18,8 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, Truth, detections_file, images
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
-from stages.scene.catalogue import Catalogue, Floats
+from stages.geometry.arrays import Floats
+from stages.scene.catalogue import Catalogue
 
 POSITION_BOUNDS = (0.01, 0.05, 0.10, 0.20)
 """Metres: one panel each, as in the paper."""

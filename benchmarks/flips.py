@@ -28,6 +28,7 @@ from stages.devices import fetch
 from stages.devices.bop_results import Result
 from stages.devices.tabletop import TABLE
 from stages.estimate import Quiet
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, inverse, pose
 from stages.messages import Candidate, Candidates, ObjectPose, Observation, SceneEstimate, Snapshot
 from stages.perception.filter.likelihood import ObservedScene
@@ -36,7 +37,7 @@ from stages.perception.observation.preprocessing import preprocess
 from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.perception.rendering.renderer import Camera, Item, Renderer
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 ROOT = Path(__file__).parents[1]
 CATALOGUE = ROOT / "stages" / "scene" / "catalogue.yaml"

@@ -15,10 +15,11 @@ from typing import Any, cast
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, pose
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 PARTICLES = 625
 CATALOGUE = Path(__file__).parents[1] / "stages" / "scene" / "catalogue.yaml"

@@ -18,13 +18,14 @@ from benchmarks.accuracy import Score, score
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, detections_file, images
 from stages.devices.bop_results import read_results
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.proposals import Dof, Proposals
 from stages.perception.hypotheses.composition import fit
 from stages.perception.observation.preprocessing import preprocess
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.metrics import nearest_symmetries, pose_errors
 
 _MAX_HEIGHT = 0.6

@@ -11,10 +11,11 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import is_pose
 from stages.messages import Frame, LookRequest, Snapshot
 from stages.perception.rendering.depth_noise import color_noise, structured_light
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 
 class SimulatedCamera(Stage):

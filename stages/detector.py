@@ -11,9 +11,10 @@ import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Candidates, Frame
 from stages.perception.hypotheses.duplicates import distinct
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 _FAR = np.float32(100.0)
 """Metres: the robot's own body is put where no object is looked for."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from runner.contract import Context, Level, Message, Refused
 from stages.detector import Detector
+from stages.geometry.arrays import Floats
 from stages.hypotheses import Hypotheses
 from stages.messages import (
     Assertion,
@@ -31,7 +32,7 @@ from stages.messages.scene import UnknownRegion
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
 from stages.refiner import Refiner
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene_graph import SceneGraphBuilder
 
 Box = tuple[str, Sequence[float]] | tuple[str, Sequence[float], float]

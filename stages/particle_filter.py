@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
 from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
@@ -18,7 +19,7 @@ from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.particle_filter import FilterSettings, Track
 from stages.perception.hypotheses.composition import charge
 from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.naming import unique_names
 
 

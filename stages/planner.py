@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from runner.contract import Refused, Stage
+from stages.geometry.arrays import Floats
 from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning import search
 from stages.planning.pddl import DOMAIN, problem_pddl
@@ -16,7 +17,7 @@ from stages.planning.placements import Placements, Scene
 from stages.planning.problem import TABLE, Problem, carriers, cycle
 from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.stance import Stances
 from stages.scene.virtual import satisfied
 

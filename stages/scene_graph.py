@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.contract import Refused, Stage
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose, SceneObject
 from stages.scene import relations, virtual
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.relations import Tolerances
 from stages.scene.stance import Stances, Standing
 

@@ -36,6 +36,7 @@ from runner.view.drawing import (
     Text,
     Transform,
 )
+from stages.geometry.arrays import Floats
 from stages.geometry.camera import back_project
 from stages.messages import (
     Arrange,
@@ -62,7 +63,7 @@ from stages.messages import (
 from stages.messages.digest import ParticleTrace
 from stages.messages.scene import UnknownRegion
 from stages.perception.rendering.renderer import Camera, Item, Renderer
-from stages.scene.catalogue import Catalogue, Floats, Mesh
+from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.relations import TABLE
 from stages.scene.text import SURE, support
 

@@ -13,9 +13,10 @@ import numpy as np
 from benchmarks.baselines.observed import Crop, Observed
 from benchmarks.baselines.registration import Model
 from benchmarks.common.datasets import Image
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 Dof = Literal[3, 6]
 Found = tuple[str, Floats, float]

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.baselines.common import Box
 from benchmarks.baselines.icp import on_plane, refined
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 _NEIGHBOURS = 20
 

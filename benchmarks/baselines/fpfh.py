@@ -17,7 +17,7 @@ from benchmarks.baselines.common import Box, PerBox
 from benchmarks.baselines.features import normals, polished, voxel_thinned
 from benchmarks.baselines.registration import Model
 from runner.contract import Refused
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 _TRIPLES = 200_000
 _ALIKE = 0.9

@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.baselines.common import Box, PerBox, untrained
 from benchmarks.baselines.observed import Crop
 from benchmarks.baselines.registration import Grid, Model, directions, model_to_readings, readings_to_model, thinned
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
-from stages.scene.catalogue import Floats
 
 _YAWS = 12
 _DEPTHS = (50, 75)

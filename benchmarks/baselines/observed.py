@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.datasets import Image
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate
 from stages.perception.observation.preprocessing import preprocess
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
-from stages.scene.catalogue import Floats
 
 Region = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""

@@ -22,8 +22,9 @@ from benchmarks.baselines.icp import best, on_plane, rotations, starts
 from benchmarks.baselines.observed import Observed
 from benchmarks.baselines.registration import Model
 from benchmarks.common.datasets import Image
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.rasteriser import Float32s, View, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _CELL = 0.04
 _YAWS = 16

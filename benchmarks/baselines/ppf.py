@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from benchmarks.baselines.common import Box, PerBox
 from benchmarks.baselines.features import normals, polished, voxel_thinned
 from benchmarks.baselines.registration import Model
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 _STEP = 0.05
 _ANGLES = 30

@@ -6,8 +6,8 @@ import numpy as np
 
 from benchmarks.baselines.common import Box, PerBox, untrained
 from benchmarks.baselines.icp import on_plane
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, random_rotations
-from stages.scene.catalogue import Floats
 
 
 def poses(box: Box, trained: None = None) -> Floats:

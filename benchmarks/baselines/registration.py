@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.rasteriser import Soup
-from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.catalogue import CatalogueObject
 
 _SAMPLES = 6000
 _RENDERED = 1000

@@ -14,10 +14,10 @@ from runner.contract import Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections
 from stages.estimate import Quiet
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Candidate, Candidates, Frame
 from stages.messages.arrays import Depth, Intrinsics, Rgb
-from stages.scene.catalogue import Floats
 
 ImageId = tuple[int, int]
 """scene_id, im_id."""

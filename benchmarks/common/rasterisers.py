@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from stages.geometry.arrays import Floats
 from stages.perception.filter.likelihood import CostForm, Window
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 Costs = Callable[[Floats], Floats]
 """Poses P x 3 x 4 of the object -> its change of cost, P."""

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages.digest import SceneEstimate
 from stages.messages.scene import ObjectPose, SceneGraph
-from stages.scene.catalogue import Floats
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 

@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from stages.devices.bop import TARGETS
 from stages.devices.drops import Thing, settle, things
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages.arrays import Depth, Rgb
 from stages.perception.detection.trained.training_images import random_texture
 from stages.perception.rendering.contact_sheet import looking_at
 from stages.perception.rendering.depth_noise import StructuredLight, color_noise, structured_light
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Mesh
+from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
 
 SIZE = 640, 480
 K = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])

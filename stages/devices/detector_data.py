@@ -12,12 +12,13 @@ from stages.devices import fetch
 from stages.devices.drops import distractors, random_layout, things
 from stages.devices.simulated_camera import K, SimulatedCamera
 from stages.devices.tabletop import GOALS, sample_goal, sample_start
+from stages.geometry.arrays import Floats
 from stages.messages import Snapshot
 from stages.perception.detection.trained.network import HEIGHT, WIDTH, fit
 from stages.perception.detection.trained.training_images import Example, labelled, render_example, save_examples
 from stages.perception.rendering.depth_noise import color_noise
 from stages.perception.rendering.renderer import Camera, Item, Renderer
-from stages.scene.catalogue import BUILT_IN, Catalogue, Floats
+from stages.scene.catalogue import BUILT_IN, Catalogue
 
 
 def examples(

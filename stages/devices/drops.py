@@ -10,8 +10,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from stages.geometry.arrays import Floats
 from stages.perception.detection.trained.training_images import DISTRACTOR, Body, Layout
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Mesh, Primitive
+from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh, Primitive
 
 _TIMESTEP = 0.004
 _SETTLE_STEPS = 350

@@ -19,9 +19,10 @@ import mujoco
 import numpy as np
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.robot import Gripper, RobotModel
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from stages.devices import fetch
 from stages.devices.tabletop import TABLE
+from stages.geometry.arrays import Floats
 from stages.geometry.camera import intrinsics
 from stages.messages import Snapshot
 from stages.messages.arrays import Depth, Mask, Rgb
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.scene.catalogue import Catalogue, Floats, Mesh
+from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.catalogue.household_meshes import block
 
 WIDTH, HEIGHT = fetch.CAMERA_SIZE

@@ -9,9 +9,10 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from stages.devices import fetch, tabletop
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import add_primitives, add_table, quaternion
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _TIMESTEP = 0.002
 _SETTLE_AFTER_MOTION = 0.25

@@ -11,9 +11,10 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.devices import fetch
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
 from stages.planning.collision import Table
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats, Primitive
+from stages.scene.catalogue import Catalogue, CatalogueObject, Primitive
 
 TABLE = Table(center=(0.80, 0.0), size=(0.70, 1.20), height=0.70)
 TRAY = "tray"

@@ -1,4 +1,4 @@
-"""Rows of an array that are equal."""
+"""Arrays of numbers, and which of their rows are equal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 

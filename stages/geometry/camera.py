@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.messages.arrays import Depth, Intrinsics
-from stages.scene.catalogue import Floats
 
 
 def intrinsics(focal: float, width: int, height: int) -> Intrinsics:

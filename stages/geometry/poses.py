@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 _TINY = 1e-12
 

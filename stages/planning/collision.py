@@ -10,9 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.robot import RobotModel
-from stages.scene.catalogue import CatalogueObject, Floats, Primitive
+from stages.scene.catalogue import CatalogueObject, Primitive
 
 AMPLE = 0.015
 """Metres that motions far from what is grasped and placed keep from everything, where there is room."""

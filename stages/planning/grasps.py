@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.scene.catalogue import CatalogueObject, Floats, Grasp
+from stages.geometry.arrays import Floats
+from stages.scene.catalogue import CatalogueObject, Grasp
 
 _STEP = np.deg2rad(22.5)
 """How finely a continuous symmetry is sampled."""

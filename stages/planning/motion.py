@@ -16,10 +16,10 @@ import ompl.base as ob
 import ompl.geometric as og
 import ompl.util as ou
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld, quaternion
 from stages.planning.robot import RobotModel
-from stages.scene.catalogue import Floats
 
 POSITION_TOLERANCE = 5e-4
 """Metres per axis at which inverse kinematics is content."""

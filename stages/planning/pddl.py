@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.geometry.arrays import Floats
 from stages.messages.scene import SceneGraph
 from stages.planning.problem import TABLE, Problem
-from stages.scene.catalogue import Floats
 
 DOMAIN = """\
 ; Picking and placing on a table. Items rest on convex items and on the table, and in concave items.

@@ -9,12 +9,13 @@ from itertools import islice, product
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
 from stages.planning.grasps import HandPose, distinct_grasps, hand_poses
 from stages.planning.motion import free_motion, restarts, solve_ik, straight_motion
-from stages.scene.catalogue import CatalogueObject, Floats, Grasp
+from stages.scene.catalogue import CatalogueObject, Grasp
 
 LIFT = 0.12
 """Metres that an object is lifted before it is carried."""

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.geometry import regions
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.geometry.regions import Region
 from stages.messages.scene import SceneGraph
 from stages.planning.problem import TABLE, carriers
 from stages.planning.search import Step
-from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.catalogue import CatalogueObject
 from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed
 from stages.scene.virtual import region_poses
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 
 @dataclass(frozen=True)

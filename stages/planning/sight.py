@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 from stages.scene.stance import Standing
 
 _HEIGHTS = np.array([0.1, 0.5, 0.9])

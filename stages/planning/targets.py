@@ -10,12 +10,13 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.geometry import regions
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.planning.placements import Placement, Placements, Scene
 from stages.planning.problem import TABLE
 from stages.planning.search import Step
 from stages.planning.sight import hidden_share
-from stages.scene.catalogue import Floats, Grasp
+from stages.scene.catalogue import Grasp
 from stages.scene.stance import Standing
 
 TOUCHING = 0.002

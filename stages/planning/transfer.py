@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.task import FailedStage
@@ -15,7 +16,7 @@ from stages.planning.collision import CollisionWorld, Table
 from stages.planning.motion import free_motion, straight_motion, time_parameterise
 from stages.planning.pick_place import HOVER, LIFT, RELEASE, ROOM, Errand, PickPlace, PickPlacePlanner, opening, raised
 from stages.planning.robot import RobotModel
-from stages.scene.catalogue import Catalogue, Floats, Grasp
+from stages.scene.catalogue import Catalogue, Grasp
 
 Routine = Generator[RobotCommand, RobotState, "Outcome"]
 Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose, rotation_angle, symmetry_angle
 from stages.messages.arrays import Intrinsics
-from stages.scene.catalogue import Floats, Symmetries
+from stages.scene.catalogue import Symmetries
 
 Image = NDArray[np.floating]
 """H x W metres along the optical axis, 0 where there is nothing."""

@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 _STAYED = 0.1
 """Metres within which an object that nobody took is found again: what touches a neighbour may push it a little."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from stages.geometry.arrays import Floats
 from stages.messages.scene import SceneObject
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.metrics import nearest_symmetries, pose_errors
 
 

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry import regions
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, rotate
 from stages.geometry.regions import Region
 from stages.messages.scene import SceneObject
 from stages.scene.catalogue import CatalogueObject
-
-Floats = NDArray[np.float64]
 
 ALIGNED = np.deg2rad(15)
 """Largest angle between gravity and an object axis that still counts as aligned, radians."""

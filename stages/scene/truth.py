@@ -10,10 +10,11 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Assertion, Goal, Outcome, SceneGraph, Snapshot, Verdict, VirtualObject
 from stages.messages.scene import SceneObject
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.relations import Tolerances, assertions, supports
 from stages.scene.scoring import label_of
 from stages.scene.stance import Stances, standing_of

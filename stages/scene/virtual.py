@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.geometry import regions
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages.scene import Assertion, SceneGraph, VirtualObject
 from stages.scene.catalogue import Catalogue, Symmetries
 from stages.scene.relations import Support
 from stages.scene.stance import Standing
-
-Floats = NDArray[np.float64]
 
 SYMMETRY_STEP = np.deg2rad(4)
 """Sampling of continuous symmetries when a ring is evaluated, radians: 1 cm at 15 cm from the axis."""

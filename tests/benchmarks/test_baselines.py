@@ -11,9 +11,9 @@ from benchmarks.baselines import METHODS, fpfh
 from benchmarks.baselines.observed import Crop, Observed
 from benchmarks.common.datasets import Image
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Candidates, Frame
 from stages.perception.rendering.rasteriser import Soup, inverse_depth
-from stages.scene.catalogue import Floats
 from stages.scene.metrics import pose_errors
 from tests.stages.perception.scenes import CATALOGUE, DATA, VIEW, K, Rendered, render, upright
 

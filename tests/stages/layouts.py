@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.geometry.arrays import Floats
 from stages.geometry.regions import moved
 from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from stages.scene.stance import Stances, Standing, yawed
 from stages.scene_graph import SceneGraphBuilder
 

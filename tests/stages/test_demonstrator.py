@@ -8,6 +8,7 @@ import pytest
 
 from runner.contract import Message, Refused
 from stages.demonstrator import Demonstrator, change_of_plan
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
     Arrangement,
@@ -23,7 +24,6 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.scene.catalogue import Floats
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout
 from tests.stages.perception.scenes import K, camera, render, upright

@@ -9,10 +9,10 @@ import pytest
 from runner.contract import Level, Refused
 from stages.devices import fetch, tabletop
 from stages.executor import Executor
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
 from stages.messages import Arrangement, LookRequest, Outcome, RobotCommand, SceneGraph, Transfer, TransferRequest
 from stages.messages.scene import SceneObject
-from stages.scene.catalogue import Floats
 from stages.world import World
 from tests.stages.planning.scenes import CATALOGUE_FILE, standing
 

@@ -20,6 +20,7 @@ import yaml
 from numpy.typing import NDArray
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, pose, rotate, symmetry_angle
 from stages.messages.digest import SceneEstimate
 from stages.messages.scene import Alternative, ObjectPose, UnknownRegion
@@ -28,7 +29,7 @@ from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, Obse
 from stages.perception.filter.proposals import Dof, Proposals, distinct_best
 from stages.perception.refinement.refinement import RefinedObject
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 RIGHT_METRES = 0.02
 RIGHT_RADIANS = np.deg2rad(15.0)

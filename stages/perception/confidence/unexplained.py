@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import rotate
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Float32s
-from stages.scene.catalogue import Floats
 
 Mask = NDArray[np.bool_]
 

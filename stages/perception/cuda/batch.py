@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.perception.cuda.cost_kernel import evaluate
 from stages.perception.cuda.polish_kernel import refine
 from stages.perception.cuda.scalars import SIMULATED, cuda
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, Shape, Window
 from stages.perception.rendering.rasteriser import LANES, Float32s, Soup
-from stages.scene.catalogue import Floats
 
 THREADS = 2 if SIMULATED else 128
 """Per particle; a power of two. Sums are taken in this many strands, so another number changes the last bits. In the

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from runner.contract import Refused
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 if TYPE_CHECKING:
     from stages.perception.filter.likelihood import ObjectLikelihood

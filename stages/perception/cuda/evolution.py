@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.perception.cuda.batch import Batch, Launch, Look, put
 from stages.perception.cuda.cost_kernel import NOTHING
 from stages.perception.cuda.transition_kernel import DONE, SIZE, STEP, evolve
 from stages.perception.filter.evolution import POLISH_GATE, POLISH_STEPS, THINNED, Generation, Population, Step
-from stages.scene.catalogue import Floats
 
 if TYPE_CHECKING:
     from stages.perception.filter.particle_filter import FilterSettings

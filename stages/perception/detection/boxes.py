@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Floats = NDArray[np.float64]
+from stages.geometry.arrays import Floats
 
 
 def intersection_over_union(a: Floats, b: Floats) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
-from stages.scene.catalogue import Floats
+from stages.geometry.arrays import Floats
 
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]

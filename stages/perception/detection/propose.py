@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.detection.appearance import Bytes
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.labels import Judge
 from stages.perception.detection.regions import Region, regions
 from stages.perception.detection.views import Views
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats
 
 _WIDTH = 640
 """Images are reduced to about so many columns."""

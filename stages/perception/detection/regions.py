@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.perception.detection.appearance import Bytes, Mask
 from stages.perception.detection.boxes import survivors
 from stages.perception.detection.merging import Labels, Pieces, components, merged
 from stages.perception.detection.supports import Support, supports
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats
 
 _FARTHEST = 2.5
 """Metres beyond which depth cameras see too little of household objects."""

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.observation.plane import find_plane, height_above, noise
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats
 
 Mask = NDArray[np.bool_]
 

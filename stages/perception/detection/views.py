@@ -15,11 +15,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.perception.detection.appearance import Bytes, Float32s, Looks, Mask, square
 from stages.perception.rendering.contact_sheet import looking_at
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.catalogue.mesh_shape import resting_rotations, transform
 
 _SOURCES = ("views", "appearance", "backbone")

@@ -14,10 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.filter.likelihood import ObjectLikelihood
 from stages.perception.filter.proposals import Guess, Proposals
 from stages.perception.rendering.rasteriser import KERNEL
-from stages.scene.catalogue import Floats
 
 if TYPE_CHECKING:
     from stages.perception.filter.particle_filter import FilterSettings

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from stages.geometry.arrays import Floats
 from stages.perception.cuda.device import Device, cuda_evaluator
 from stages.perception.rendering.kernels import change_of_cost, evidence, gauss_newton
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 _STRAY = 4.0
 """A centre one apparent diameter outside costs so many times what the window costs without the object."""

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.perception.cuda.device import Device
 from stages.perception.filter.evolution import THINNED, Generation, Population, Step, evolved, resampled, steps
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window, credits
 from stages.perception.filter.proposals import Dof, Guess, Proposals, distinct_best
 from stages.perception.rendering.rasteriser import Float32s
-from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.catalogue import CatalogueObject
 
 Rectangle = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""

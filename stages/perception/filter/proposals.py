@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from stages.geometry.arrays import distinct_rows
+from stages.geometry.arrays import Floats, distinct_rows
 from stages.geometry.poses import (
     compose,
     cube_rotations,
@@ -20,7 +20,7 @@ from stages.geometry.poses import (
     symmetry_angle,
 )
 from stages.perception.rendering.rasteriser import KERNEL
-from stages.scene.catalogue import CatalogueObject, Floats
+from stages.scene.catalogue import CatalogueObject
 
 Dof = Literal[3, 6]
 _SAME = np.deg2rad(12.0)

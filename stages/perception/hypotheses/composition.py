@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.messages.digest import Glimpse
 from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
 from stages.perception.filter.particle_filter import pixels
 from stages.perception.rendering.rasteriser import Float32s
-from stages.scene.catalogue import Floats
 
 REACH = 0.25
 """Share of a candidate's box by which it is grown to where its object may explain readings: boxes are not exact."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.messages.scene import ObjectPose
-from stages.scene.catalogue import Floats
 
 _SHARED = 0.6
 """Share of the smaller of two boxes that lies in the other if both frame one object, or a part of it."""

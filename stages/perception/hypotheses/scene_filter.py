@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.messages.digest import Glimpse
 from stages.perception.filter.likelihood import ObservedScene, with_object
 from stages.perception.filter.particle_filter import FilterSettings, ObjectFilter, Task, Track, pixels, run_together
 from stages.perception.hypotheses.composition import Composition, fit, glimpse, rise, scene_cost
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 _IDLE = 0.01
 """An object explains nothing if it lowers the cost of the scene by a smaller share."""

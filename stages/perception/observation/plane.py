@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.geometry.regions import EMPTY, Region, hull
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats
 
 _SAMPLES = 6000
 _TRIALS = 400

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.messages.digest import Candidate, Observation
 from stages.messages.sensing import Frame
 from stages.perception.observation.plane import find_plane, height_above, noise, support_region
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats
 
 _MARGIN = 0.5
 """The working area reaches beyond the candidates' boxes by this share of their common extent."""

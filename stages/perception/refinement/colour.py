@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from stages.geometry.arrays import distinct_rows
+from stages.geometry.arrays import Floats, distinct_rows
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 _SPACING = 0.002
 """Metres between samples of a painted surface."""

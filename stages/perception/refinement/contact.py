@@ -17,9 +17,10 @@ import numba
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, rotate
 from stages.perception.rendering.rasteriser import INLINED, KERNEL, Float32s
-from stages.scene.catalogue import CatalogueObject, Floats, Mesh
+from stages.scene.catalogue import CatalogueObject, Mesh
 
 _SAMPLES = 300
 _HULL = 100

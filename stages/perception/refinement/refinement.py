@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import symmetry_angle
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.particle_filter import FilterSettings, Rectangle
@@ -22,7 +23,7 @@ from stages.perception.hypotheses.composition import fit, scene_cost
 from stages.perception.refinement.colour import Contender, Paint, Verdict, judge
 from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _GAIN = 5e-6
 """Metres per visible pixel by which a moved object must lower the scene's cost."""

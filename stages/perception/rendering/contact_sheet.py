@@ -9,8 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.renderer import Camera, Item, Lighting, Renderer
-from stages.scene.catalogue import Catalogue, CatalogueObject, Floats
+from stages.scene.catalogue import Catalogue, CatalogueObject
 
 TILE = (230, 210)
 COLUMNS = 5

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.geometry.camera import back_project
 from stages.messages.arrays import Depth, Intrinsics, Mask, Rgb
-from stages.scene.catalogue import Floats
 
 
 @dataclass(frozen=True)

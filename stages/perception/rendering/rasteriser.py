@@ -19,8 +19,9 @@ import numpy as np
 from numpy import ceil, floor
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.pixel_math import INLINED, KERNEL, NEAR, project, screen_matrix, triangle_setup
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 Float32s = NDArray[np.float32]
 

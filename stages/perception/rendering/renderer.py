@@ -21,7 +21,8 @@ import pyrender
 from pyrender.constants import RenderFlags
 from scipy.spatial import KDTree
 
-from stages.scene.catalogue import Floats, Mesh
+from stages.geometry.arrays import Floats
+from stages.scene.catalogue import Mesh
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _GAMMA = 2.2  # The shader's output gamma; inverting it keeps a lit vertex colour what the catalogue says.

@@ -15,7 +15,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from stages.scene.catalogue.objects import Floats, Mesh
+from stages.geometry.arrays import Floats
+from stages.scene.catalogue.objects import Mesh
 
 Bools = NDArray[np.bool_]
 Color = tuple[int, int, int]

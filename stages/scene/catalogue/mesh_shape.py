@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from stages.scene.catalogue.objects import Floats, Mesh
+from stages.geometry.arrays import Floats
+from stages.scene.catalogue.objects import Mesh
 
 _SAME_FACE = np.cos(np.deg2rad(20.0))
 _MOST_RESTING = 12

@@ -15,9 +15,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from runner.contract import Refused
-from stages.geometry.arrays import distinct_rows
+from stages.geometry.arrays import Floats, distinct_rows
 
-Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 GraspKind = Literal["top", "side"]
 BUILT_IN = Path(__file__).parents[1] / "catalogue.yaml"

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import is_pose, is_rotation
 from stages.scene.catalogue.mesh_shape import axis_rotation, resting_rotations, transform, turned_up, width_between
-from stages.scene.catalogue.objects import Floats, Grasp, Mesh, Primitive, Symmetries
+from stages.scene.catalogue.objects import Grasp, Mesh, Primitive, Symmetries
 from stages.scene.catalogue.sections import Section, is_number
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

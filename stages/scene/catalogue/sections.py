@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from runner.contract import Refused
-from stages.scene.catalogue.objects import Floats
+from stages.geometry.arrays import Floats
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _REQUIRED: Any = object()

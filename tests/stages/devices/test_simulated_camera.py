@@ -10,9 +10,10 @@ import stages.scene
 from stages.devices import fetch
 from stages.devices.simulated_camera import HEIGHT, ROBOT_MARGIN, WIDTH, K, SimulatedCamera, robot_pixels
 from stages.devices.tabletop import TABLE
+from stages.geometry.arrays import Floats
 from stages.geometry.camera import project, rays
 from stages.messages import Snapshot
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 CATALOGUE = Catalogue.load(Path(stages.scene.__file__).parent / "catalogue.yaml")
 FORWARD = dict(zip(fetch.ARM_JOINTS, (0.30, 0.0, -0.2, 0.0, 0.9, 0.0, 0.8, 0.0), strict=True))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.rasteriser import View
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 # Images this small only lose time to threads, the more the busier the machine.
 torch.set_num_threads(1)

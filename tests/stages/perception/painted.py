@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
+from stages.geometry.arrays import Floats
 from stages.perception.refinement.colour import surface_normals
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 LIGHT = np.array([0.3, -0.5, -0.8])
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"
 CATALOGUE = Catalogue.load(CATALOGUE_FILE)

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from stages.devices import fetch, tabletop
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 
 CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.perception.detection.trained.network import HEIGHT, WIDTH
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 
 Image = NDArray[np.uint8]
 DISTRACTOR = -1

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.perception.confidence.doubt import (
     CONSTANTS,
@@ -19,7 +20,6 @@ from stages.perception.confidence.doubt import (
     cost_of_an_object,
     hypothesis_probabilities,
 )
-from stages.scene.catalogue import Floats
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
 
 BOX = upright("tea_box", 0.0, 0.0, 0.6)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Observation, SceneGraph
 from stages.messages.scene import SceneObject
 from stages.perception.confidence.memory import Memory
-from stages.scene.catalogue import Floats
 from tests.stages.layouts import T_BASE_TABLE, Layout, asserted
 from tests.stages.perception.scenes import CATALOGUE, K, camera, render, upright
 

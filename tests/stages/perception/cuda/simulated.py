@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.cuda import deviation, exchanged, problem, resident
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, log_so3, pose, rotate
 from stages.perception.cuda.batch import Batch, Launch, Look
 from stages.perception.cuda.cost_kernel import block_sum
@@ -34,7 +35,7 @@ from stages.perception.filter.particle_filter import FilterSettings, ObjectFilte
 from stages.perception.filter.proposals import Dof, Guess, Proposals
 from stages.perception.rendering.kernels import IMPOSSIBLE
 from stages.perception.rendering.rasteriser import Soup, inverse_depth
-from stages.scene.catalogue import Floats, Mesh
+from stages.scene.catalogue import Mesh
 from stages.scene.metrics import pose_errors
 from tests.stages.perception import oracle
 from tests.stages.perception.scenes import CATALOGUE, camera, upright

@@ -7,12 +7,13 @@ from functools import cache
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.messages import Frame
 from stages.perception.detection.views import Views
 from stages.perception.rendering.contact_sheet import looking_at
 from stages.perception.rendering.rasteriser import Float32s, View
 from stages.perception.rendering.renderer import Camera, Item, Renderer
-from stages.scene.catalogue import Catalogue, Floats, Mesh
+from stages.scene.catalogue import Catalogue, Mesh
 from tests.stages.perception.scenes import CATALOGUE, upright
 
 NAMES = ("bowl", "cereal_box", "sauce_bottle")

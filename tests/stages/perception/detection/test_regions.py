@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from stages.geometry.arrays import Floats
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.regions import Region, regions
 from stages.perception.detection.supports import supports
-from stages.scene.catalogue import Floats
 from tests.stages.perception.detection.scenes import NAMES, T_TABLE_CAMERA, VIEW, Photograph, photograph
 from tests.stages.perception.scenes import CATALOGUE
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import random_rotations
 from stages.perception.filter.likelihood import CostForm, Shape
 from stages.perception.hypotheses.combinations import cheapest
 from stages.perception.hypotheses.composition import STRIDE, Composition, FirstLook, charge, glimpse, rise, scene_cost
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene.catalogue import Floats
 from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
 
 PLACED = {

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose, symmetry_angle
 from stages.perception.filter.particle_filter import FilterSettings
 from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
-from stages.scene.catalogue import Catalogue, Floats
+from stages.scene.catalogue import Catalogue
 from tests.stages.perception.painted import painted
 from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
 
