@@ -1,11 +1,10 @@
-"""The object catalogue: what the system knows of every object before it looks."""
+"""An object of a catalogue: mesh, symmetries, resting poses, grasps and collision geometry."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cache, cached_property
-from pathlib import Path
+from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import fast_simplification
@@ -14,13 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from runner.contract import Refused
 from stages.geometry.arrays import Floats, distinct_rows
 
 Faces = NDArray[np.int32]
 GraspKind = Literal["top", "side"]
-BUILT_IN = Path(__file__).parents[1] / "catalogue.yaml"
-"""The catalogue that comes with the package."""
 T = TypeVar("T")
 
 _AGGRESSIVENESS = (3.0, 5.0, 7.0)
@@ -128,40 +124,6 @@ class CatalogueObject:
     @cached_property
     def _made(self) -> dict[Hashable, Any]:
         return {}
-
-
-@dataclass(frozen=True)
-class Catalogue:
-    """Objects by name."""
-
-    objects: dict[str, CatalogueObject]
-
-    @staticmethod
-    def load(path: Path) -> Catalogue:
-        """Reads a catalogue YAML file or a BOP ``models`` folder.
-
-        Raises :class:`runner.contract.Refused` naming file, object, key and valid choices.
-        """
-        # Reading needs the types of this module.
-        from stages.scene.catalogue.loading import read_objects
-
-        return Catalogue(read_objects(path))
-
-    @staticmethod
-    @cache
-    def shared(path: Path) -> Catalogue:
-        """As :meth:`load`, but read once for all stages of this process and of those that are forked from it."""
-        return Catalogue.load(path)
-
-    def __getitem__(self, label: str) -> CatalogueObject:
-        """The object of that name.
-
-        Raises:
-            Refused: there is none; names those that there are.
-        """
-        if label not in self.objects:
-            raise Refused(f"'{label}' is not in the catalogue, which has {', '.join(self.objects)}")
-        return self.objects[label]
 
 
 def _turns(axis: Floats, offset: Floats, step: float) -> Floats:
