@@ -20,7 +20,7 @@ from benchmarks.common.datasets import detections_file, images
 from benchmarks.estimate import Settings, estimates, results
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
-from stages.perception.filter.particle_filter import IMPROVEMENTS
+from stages.perception.filter.settings import IMPROVEMENTS
 from stages.scene.catalogue import Catalogue
 
 _BOUNDS = ((0.01, 10.0), (0.02, 15.0))

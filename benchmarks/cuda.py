@@ -19,8 +19,8 @@ from stages.particle_filter import ParticleFilter
 from stages.perception.cuda.device import cuda_obstacle
 from stages.perception.filter.evolution import Population, Step
 from stages.perception.filter.likelihood import ObjectLikelihood
-from stages.perception.filter.particle_filter import FilterSettings
 from stages.perception.filter.proposals import Guess, Proposals
+from stages.perception.filter.settings import FilterSettings
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.metrics import pose_errors
 
@@ -47,7 +47,7 @@ def resident(
     polish of as many particles as the filter's."""
     from stages.perception.cuda.evolution import CudaEvolution
 
-    settings = replace(FilterSettings(particles=len(poses)), schedule=None, device="cuda")
+    settings = replace(FilterSettings(particles=len(poses)), schedule=None)
     proposals, T_camera_table = Proposals(item, 6), np.eye(4)
     guess = Guess(poses[:, :, 3].astype(float), T_camera_table)
     flipped, few = int(settings.flips * len(poses)), int(settings.polished * len(poses))

@@ -21,7 +21,8 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, detections_file, images
 from runner.process.children import ENVIRONMENT
 from stages.perception.filter.likelihood import ObservedScene
-from stages.perception.filter.particle_filter import FilterSettings, Track
+from stages.perception.filter.particle_filter import Track
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.combinations import cheapest, ordered
 from stages.perception.hypotheses.composition import FirstLook
 from stages.perception.hypotheses.scene_filter import SceneFilter, SceneResult, Suspect

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,8 @@ from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Post
 from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
 from stages.perception.cuda.device import DEVICES, chosen_device
 from stages.perception.filter.likelihood import ObservedScene
-from stages.perception.filter.particle_filter import FilterSettings, Track
+from stages.perception.filter.particle_filter import Track
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import charge
 from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
 from stages.scene.catalogue import Catalogue
@@ -72,8 +73,8 @@ class ParticleFilter(Stage):
         settings = make(particles=config.particles, iterations=config.iterations, dof=config.dof).without(
             *config.without
         )
-        settings = replace(settings, device=chosen_device(config.device, place="particle_filter.device"))
-        self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, seed=config.seed)
+        device = chosen_device(config.device, place="particle_filter.device")
+        self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, device=device, seed=config.seed)
         self._filter.warm_up()
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:

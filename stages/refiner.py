@@ -14,7 +14,7 @@ from stages.geometry.poses import pose
 from stages.messages import ObjectPose, Observation, SceneEstimate
 from stages.perception.confidence.doubt import Judge, annotated, judged
 from stages.perception.filter.likelihood import ObservedScene
-from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.refinement.refinement import Placed, RefinedObject, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
 

@@ -9,7 +9,7 @@ from benchmarks.ablation import DEFAULT, PAPER, Outcome, Source, chosen, differe
 from benchmarks.accuracy import Score
 from benchmarks.common.datasets import Truth
 from runner.contract import Refused
-from stages.perception.filter.particle_filter import IMPROVEMENTS
+from stages.perception.filter.settings import IMPROVEMENTS
 
 
 def outcome(name: str, *images: tuple[float, ...]) -> Outcome:

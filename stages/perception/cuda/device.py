@@ -6,29 +6,12 @@ device; ``auto`` replays to the same bytes only where the same kind of device is
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any
 
 from runner.contract import Refused
-from stages.geometry.arrays import Floats
+from stages.perception.filter.evolution import CPU, Device
 
-if TYPE_CHECKING:
-    from stages.perception.filter.likelihood import ObjectLikelihood
-    from stages.perception.rendering.rasteriser import Float32s
-
-Device = Literal["cpu", "cuda"]
 DEVICES = ("auto", "cpu", "cuda")
-
-
-class Evaluator(Protocol):
-    """What a device does with poses P x 3 x 4 of one object in one window."""
-
-    def changes(self, poses: Floats) -> Float32s:
-        """Changes of cost, P."""
-        ...
-
-    def refined(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
-        """Poses after Gauss-Newton steps, as ``ObjectLikelihood.refine``."""
-        ...
 
 
 def chosen_device(device: str, *, place: str) -> Device:
@@ -36,13 +19,15 @@ def chosen_device(device: str, *, place: str) -> Device:
     if device not in DEVICES:
         raise Refused(f"{place} is '{device}'; choose {', '.join(DEVICES[:-1])} or {DEVICES[-1]}")
     if device == "cpu":
-        return "cpu"
+        return CPU
     obstacle = cuda_obstacle()
     if obstacle is None:
-        return "cuda"
+        from stages.perception.cuda.evolution import CUDA
+
+        return CUDA
     if device == "cuda":
         raise Refused(f"{place} is 'cuda', but {obstacle}; choose auto or cpu")
-    return "cpu"
+    return CPU
 
 
 def cuda_obstacle() -> str | None:
@@ -56,10 +41,3 @@ def cuda_obstacle() -> str | None:
         return None if own else "the package numba-cuda is not installed (extra 'cuda')"
     reason = str(cuda.cuda_error() or "no device").strip().splitlines()[0].rstrip(".")
     return f"numba finds no GPU ({reason})"
-
-
-def cuda_evaluator(likelihood: ObjectLikelihood) -> Evaluator:
-    """The GPU's costs and polish of one object in one window; both stay on the device as long as this lives."""
-    from stages.perception.cuda.batch import Batch, Look
-
-    return Batch([likelihood.shape], [Look.of(likelihood)])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import gcd
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +19,10 @@ from stages.geometry.arrays import Floats
 from stages.perception.cuda.batch import Batch, Launch, Look, put
 from stages.perception.cuda.cost_kernel import NOTHING
 from stages.perception.cuda.transition_kernel import DONE, SIZE, STEP, evolve
-from stages.perception.filter.evolution import POLISH_GATE, POLISH_STEPS, THINNED, Generation, Population, Step
-
-if TYPE_CHECKING:
-    from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.evolution import POLISH_GATE, POLISH_STEPS, THINNED, Device, Generation, Population, Step
+from stages.perception.filter.likelihood import CostForm, Shape, Window
+from stages.perception.filter.settings import FilterSettings
+from stages.perception.rendering.rasteriser import Float32s
 
 _SHARED_BYTES = 48 * 1024
 """What a block may have without asking the driver for more."""
@@ -116,6 +116,14 @@ class CudaEvolution:
         self._polished = put(np.zeros(count), np.int32)
         self._history = put(np.zeros((count, length)), np.float32)
         self._traces = put(np.zeros((count, length, -(-self._capacity // THINNED), 3)), np.float32)
+
+
+def evaluator(shape: Shape, window: Window, plane: Float32s, form: CostForm) -> Batch:
+    """The GPU's costs and polish of one object in one window; both stay on the device as long as this lives."""
+    return Batch([shape], [Look(window, plane, form)])
+
+
+CUDA = Device(evaluator, CudaEvolution)
 
 
 def _tables(

@@ -6,21 +6,19 @@ polish are the same on both sides of it; random numbers and rounding are each de
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.perception.filter.likelihood import ObjectLikelihood
+from stages.perception.filter.likelihood import CpuEvaluator, MakeEvaluator, ObjectLikelihood
 from stages.perception.filter.proposals import Guess, Proposals
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.rendering.rasteriser import KERNEL
-
-if TYPE_CHECKING:
-    from stages.perception.filter.particle_filter import FilterSettings
 
 POLISH_STEPS, POLISH_GATE = 2, 0.03
 """Gauss-Newton steps within an iteration, and the distance in metres from which readings take no part in them."""
@@ -110,21 +108,23 @@ class Evolution(Protocol):
         ...
 
 
-def evolved(populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings) -> Evolution:
+@dataclass(frozen=True)
+class Device:
+    """Where particles are weighed, resampled, moved and polished."""
+
+    evaluator: MakeEvaluator
+    evolution: Callable[[Sequence[Population], Sequence[Step], FilterSettings], Evolution]
+
+
+def evolved(
+    populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings, device: Device
+) -> Evolution:
     """All populations after the phase; each ends as it would alone, on a GPU they go together."""
     # A schedule of one iteration has no second half: nothing to send to a device.
-    evolution = _evolution(populations, plan, settings) if plan else HostEvolution(populations, plan, settings)
+    evolution = (device if plan else CPU).evolution(populations, plan, settings)
     while evolution.iterate(_CHECKED):
         pass
     return evolution
-
-
-def _evolution(populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings) -> Evolution:
-    if settings.device == "cpu":
-        return HostEvolution(populations, plan, settings)
-    from stages.perception.cuda.evolution import CudaEvolution
-
-    return CudaEvolution(populations, plan, settings)
 
 
 class HostEvolution:
@@ -149,6 +149,9 @@ class HostEvolution:
     def history(self) -> list[list[Generation]]:
         """As in :class:`Evolution`."""
         return [each.history for each in self._each]
+
+
+CPU = Device(CpuEvaluator, HostEvolution)
 
 
 class _Course:

@@ -8,14 +8,15 @@ costs there less what the background had cost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from stages.geometry.arrays import Floats
-from stages.perception.cuda.device import Device, cuda_evaluator
 from stages.perception.rendering.kernels import change_of_cost, evidence, gauss_newton
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
@@ -182,39 +183,75 @@ def credits(
     return (np.clip(miss, 0.0, form.truncation) * scene.foreground[part]).astype(np.float32)
 
 
+class Evaluator(Protocol):
+    """Weighs and polishes poses P x 3 x 4 of one shape in one window, on whichever device."""
+
+    def changes(self, poses: Floats) -> Float32s:
+        """By how much each pose changes the window's cost, P."""
+        ...
+
+    def refined(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
+        """As :meth:`ObjectLikelihood.refine`."""
+        ...
+
+
+MakeEvaluator = Callable[[Shape, Window, Float32s, CostForm], Evaluator]
+"""Makes one from a shape, a window, the plane (unit normal and offset) and the form of the cost."""
+
+
+class CpuEvaluator:
+    """On one core."""
+
+    def __init__(self, shape: Shape, window: Window, plane: Float32s, form: CostForm) -> None:
+        self._shape, self._window, self._plane = shape, window, plane
+        limits = form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack
+        self._limits = np.array(limits, np.float32)
+        self._evidence = evidence(
+            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(), window.credit.ravel(),
+            window.view.numbers,
+        )  # fmt: skip
+
+    def changes(self, poses: Floats) -> Float32s:
+        """As in :class:`Evaluator`."""
+        out = np.zeros(len(poses), np.float32)
+        soup = self._shape.soup
+        change_of_cost(
+            soup.lanes, soup.blocks, soup.corners, self._shape.support, np.ascontiguousarray(poses, np.float32),
+            self._window.view.numbers, self._evidence, self._plane, self._limits, out,
+        )  # fmt: skip
+        return out
+
+    def refined(self, poses: Floats, directions: Floats, *, steps: int, gate: float) -> Floats:
+        """As in :class:`Evaluator`."""
+        moved = np.array(poses, np.float64)
+        soup, window = self._shape.soup, self._window
+        gauss_newton(
+            soup.lanes, soup.blocks, soup.corners, self._shape.centre, moved, steps, gate, window.view.numbers,
+            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
+            np.ascontiguousarray(directions),
+        )  # fmt: skip
+        return moved
+
+
 class ObjectLikelihood:
-    """Costs of poses of one object in one window; owns the kernel's working memory."""
+    """Costs of poses of one object in one window."""
 
     def __init__(
-        self, shape: Shape, window: Window, scene: ObservedScene, form: CostForm, *, device: Device = "cpu"
-    ) -> None:
+        self, shape: Shape, window: Window, scene: ObservedScene, form: CostForm, *,
+        evaluator: MakeEvaluator = CpuEvaluator,
+    ) -> None:  # fmt: skip
         self.shape = shape
         self.window = window
         self.form = form
         self.plane = scene.plane
         """Unit normal and offset of the support plane."""
-        self._evidence = evidence(
-            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(), window.credit.ravel(),
-            window.view.numbers,
-        )  # fmt: skip
         self.base = float(window.credit.sum(dtype=np.float64))
         """Cost of the window without the object."""
-        self._on_gpu = None if device == "cpu" else cuda_evaluator(self)
+        self._evaluator = evaluator(shape, window, self.plane, form)
 
     def costs(self, poses: Floats) -> Floats:
         """d(R, O) of equation 9 in metres times pixels for poses P x 3 x 4 (rows of T_camera_object)."""
-        change = self._on_cpu if self._on_gpu is None else self._on_gpu.changes
-        return self.base + change(poses).astype(np.float64)
-
-    def _on_cpu(self, poses: Floats) -> Float32s:
-        out = np.zeros(len(poses), np.float32)
-        soup, window, form = self.shape.soup, self.window, self.form
-        limits = np.array([form.truncation, form.occluder_margin, form.occluder_cost, form.contact_slack], np.float32)
-        change_of_cost(
-            soup.lanes, soup.blocks, soup.corners, self.shape.support, np.ascontiguousarray(poses, np.float32),
-            window.view.numbers, self._evidence, self.plane, limits, out,
-        )  # fmt: skip
-        return out
+        return self.base + self._evaluator.changes(poses).astype(np.float64)
 
     def energies(self, poses: Floats) -> Floats:
         """Costs and what the candidate's box says against a pose, by which particles are weighted, P.
@@ -247,16 +284,7 @@ class ObjectLikelihood:
         ``directions`` are the D twists (rotation about the object's centre, translation; camera frame) in which the
         object may move, 6 x D. Readings farther than ``gate`` metres from the rendered surface take no part.
         """
-        if self._on_gpu is not None:
-            return self._on_gpu.refined(poses, directions, steps=steps, gate=gate)
-        moved = np.array(poses, np.float64)
-        soup, window = self.shape.soup, self.window
-        gauss_newton(
-            soup.lanes, soup.blocks, soup.corners, self.shape.centre, moved, steps, gate, window.view.numbers,
-            window.inverse_background.ravel(), window.observed.ravel(), window.factor.ravel(),
-            np.ascontiguousarray(directions),
-        )  # fmt: skip
-        return moved
+        return self._evaluator.refined(poses, directions, steps=steps, gate=gate)
 
 
 def with_object(background: Float32s, soup: Soup, T_camera_object: Floats, view: View) -> Float32s:

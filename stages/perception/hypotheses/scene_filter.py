@@ -11,8 +11,10 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.messages.digest import Glimpse
+from stages.perception.filter.evolution import CPU, Device
 from stages.perception.filter.likelihood import ObservedScene, with_object
-from stages.perception.filter.particle_filter import FilterSettings, ObjectFilter, Task, Track, pixels, run_together
+from stages.perception.filter.particle_filter import ObjectFilter, Task, Track, pixels, run_together
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import Composition, fit, glimpse, rise, scene_cost
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue
@@ -67,9 +69,12 @@ class SceneFilter:
     tracks are remembered either way, which saves time and changes no byte.
     """
 
-    def __init__(self, catalogue: Catalogue, settings: FilterSettings, *, seed: int = 0, memory: int = 256) -> None:
+    def __init__(
+        self, catalogue: Catalogue, settings: FilterSettings, *, device: Device = CPU, seed: int = 0, memory: int = 256
+    ) -> None:
         self._catalogue = catalogue
         self._settings = settings
+        self._device = device
         self._seed = seed
         self._memory = memory
         self._filters: dict[str, ObjectFilter] = {}
@@ -96,7 +101,8 @@ class SceneFilter:
         T_camera_table[2, 3] = 1.1
         scene = ObservedScene.of(depth, depth > 0, K, T_camera_table)
         suspect = Suspect(next(iter(self._catalogue.objects)), np.array([4.0, 3.0, 12.0, 9.0]))
-        SceneFilter(self._catalogue, replace(self._settings, iterations=2, sweeps=0)).estimate(scene, [suspect])
+        brief = replace(self._settings, iterations=2, sweeps=0)
+        SceneFilter(self._catalogue, brief, device=self._device).estimate(scene, [suspect])
 
     def look(self, scene: ObservedScene, suspect: Suspect, *, among: int) -> Track:
         """One candidate alone on the plane; the budget of iterations is divided ``among`` so many."""
@@ -273,7 +279,7 @@ class SceneFilter:
 
     def _filter(self, label: str) -> ObjectFilter:
         if label not in self._filters:
-            self._filters[label] = ObjectFilter(self._catalogue[label], self._settings)
+            self._filters[label] = ObjectFilter(self._catalogue[label], self._settings, device=self._device)
         return self._filters[label]
 
     def _layers(self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: Sequence[Track]) -> list[Float32s]:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import symmetry_angle
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.filter.particle_filter import FilterSettings, Rectangle
+from stages.perception.filter.particle_filter import Rectangle
 from stages.perception.filter.proposals import Dof, Proposals
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import fit, scene_cost
 from stages.perception.refinement.colour import Contender, Paint, Verdict, judge
 from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty

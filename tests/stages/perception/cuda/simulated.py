@@ -31,8 +31,9 @@ from stages.perception.cuda.scalars import SIMULATED
 from stages.perception.cuda.transition_kernel import evolve
 from stages.perception.filter.evolution import THINNED, HostEvolution, Population, Step
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.filter.particle_filter import FilterSettings, ObjectFilter, Task, Track, run_together
+from stages.perception.filter.particle_filter import ObjectFilter, Task, Track, run_together
 from stages.perception.filter.proposals import Dof, Guess, Proposals
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.rendering.kernels import IMPOSSIBLE
 from stages.perception.rendering.rasteriser import Soup, inverse_depth
 from stages.scene.catalogue import Mesh
@@ -206,7 +207,7 @@ def step(count: int, **changes: Any) -> Step:
 
 
 def settings_of(**changes: Any) -> FilterSettings:
-    return replace(FilterSettings(elitism=False, device="cuda"), **changes)
+    return replace(FilterSettings(elitism=False), **changes)
 
 
 def evolved(cpu: ObjectLikelihood, poses: Floats, plan: Step, *, dof: Dof = 6, **changes: Any) -> Floats:
@@ -406,7 +407,7 @@ def test_whole_filters_land_where_the_cpus_do() -> None:
     seen = holding(BOX, (camera() @ upright("cereal_box", 0.0, 0.02, 0.5))[:3])
 
     def tracks(device: str, *seeds: int) -> list[Track]:
-        owner = ObjectFilter(box, replace(chosen, device=chosen_device(device, place="device")))
+        owner = ObjectFilter(box, chosen, device=chosen_device(device, place="device"))
         tasks = [Task(owner, seen.plane_inverse, (4, 2, 19, 15), np.random.default_rng(seed)) for seed in seeds]
         return run_together(seen, tasks, iterations=6)
 
@@ -433,7 +434,8 @@ def test_the_benchmark_runs() -> None:
 def test_the_likelihood_takes_the_device() -> None:
     seen = scene()
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
-    gpu = ObjectLikelihood(cpu.shape, cpu.window, seen, cpu.form, device=chosen_device("auto", place="device"))
+    device = chosen_device("auto", place="device")
+    gpu = ObjectLikelihood(cpu.shape, cpu.window, seen, cpu.form, evaluator=device.evaluator)
     poses = around(2)
     assert gpu.energies(poses) == pytest.approx(cpu.energies(poses), rel=1e-4)
     assert gpu.energies(poses).dtype == np.float64

@@ -4,6 +4,7 @@ import pytest
 from runner.contract import Refused
 from stages.particle_filter import ParticleFilter
 from stages.perception.cuda.device import chosen_device
+from stages.perception.filter.evolution import CPU
 from tests.stages.perception.scenes import CATALOGUE_FILE
 
 HAS_GPU = numba.cuda.is_available()
@@ -15,12 +16,12 @@ def test_an_unknown_device_is_refused() -> None:
 
 
 def test_the_cpu_is_always_there() -> None:
-    assert chosen_device("cpu", place="x.device") == "cpu"
+    assert chosen_device("cpu", place="x.device") is CPU
 
 
 @pytest.mark.skipif(HAS_GPU, reason="a GPU is at hand")
 def test_auto_is_the_cpu_where_there_is_no_gpu() -> None:
-    assert chosen_device("auto", place="x.device") == "cpu"
+    assert chosen_device("auto", place="x.device") is CPU
 
 
 @pytest.mark.skipif(HAS_GPU, reason="a GPU is at hand")

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.perception.filter.evolution import HostEvolution, Population, Step, evolved, steps
-from stages.perception.filter.particle_filter import FilterSettings, ObjectFilter, Task, pixels, run_together
+from stages.perception.filter.evolution import CPU, HostEvolution, Population, Step, evolved, steps
+from stages.perception.filter.particle_filter import ObjectFilter, Task, pixels, run_together
+from stages.perception.filter.settings import FilterSettings
 from tests.stages.perception.scenes import CATALOGUE, render, upright
 
 SEEN = render({"mug": upright("mug", -0.05, 0.0, 0.6), "tea_box": upright("tea_box", 0.1, 0.06, 0.2)})
@@ -70,9 +71,9 @@ def test_iterations_in_parts_are_iterations_at_once() -> None:
 def test_a_phase_without_progress_ends_early() -> None:
     settings = replace(SETTINGS, metres=(1e-6, 1e-6), radians=(1e-6, 1e-6), flips=0.0, renewed=0.0, patience=2)
     plan = steps(settings, 0.0, 0.5, 30)
-    assert len(evolved([population(settings)], plan, settings).history()[0]) < 30
+    assert len(evolved([population(settings)], plan, settings, CPU).history()[0]) < 30
     patient = replace(settings, schedule=None)
-    assert len(evolved([population(patient)], plan, patient).history()[0]) == 30
+    assert len(evolved([population(patient)], plan, patient, CPU).history()[0]) == 30
 
 
 def test_objects_side_by_side_end_as_each_alone() -> None:

@@ -11,7 +11,7 @@ import pytest
 from runner.contract import Refused
 from stages.geometry.poses import exp_so3, pose
 from stages.perception.filter.likelihood import CostForm
-from stages.perception.filter.particle_filter import IMPROVEMENTS, FilterSettings
+from stages.perception.filter.settings import IMPROVEMENTS, FilterSettings
 from stages.perception.hypotheses.scene_filter import SceneFilter, Suspect
 from stages.scene.metrics import pose_errors
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
@@ -114,7 +114,7 @@ SCRIPT = """
 import hashlib
 from tests.stages.perception.filter.test_particle_filter import PLACED, suspects
 from tests.stages.perception.scenes import CATALOGUE, render
-from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.scene_filter import SceneFilter
 seen = render(PLACED)
 result = SceneFilter(CATALOGUE, FilterSettings(iterations=16)).estimate(seen.scene, suspects(seen, "mug", "tea_box"))

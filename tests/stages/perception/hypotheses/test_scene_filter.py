@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.scene_filter import SceneFilter, SceneResult, Suspect
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
 

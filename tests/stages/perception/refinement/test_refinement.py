@@ -13,7 +13,7 @@ import pytest
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose, symmetry_angle
-from stages.perception.filter.particle_filter import FilterSettings
+from stages.perception.filter.settings import FilterSettings
 from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.painted import painted
