@@ -1,4 +1,4 @@
-"""Which device weighs poses: the one place where ``device: auto | cpu | cuda`` becomes a function.
+"""Which device the filter runs on: the one place where ``device: auto | cpu | cuda`` becomes a :class:`Device`.
 
 The GPU's costs equal the CPU's up to rounding, not byte by byte. A recording holds the configuration and with it the
 device; ``auto`` replays to the same bytes only where the same kind of device is at hand.
