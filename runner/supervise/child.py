@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.graph.graph import Limits, Route
+from runner.hosts.head import RemoteChild
 from runner.message.codec import Pulse, Step, answered
 from runner.message.ids import MessageId
 from runner.message.packet import Process
@@ -36,7 +37,7 @@ class Child:
     """When it is killed if it has not gone by itself; None where it was not asked to."""
     watch: Watch = field(default_factory=lambda: Watch(Limits()))
     oom_kills: int = field(default_factory=oom_kills)
-    """By the kernel, before it was started."""
+    """By the kernel of this machine, before it was started."""
     log_from: int = 0
     """Where its own lines begin in the log."""
     condemned: str = ""
@@ -58,7 +59,8 @@ class Child:
         code = self.handle.returncode or 0
         if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
             return lines[0]
-        if code != -signal.SIGKILL or oom_kills() == self.oom_kills:
+        elsewhere = isinstance(self.handle, RemoteChild)  # whose kernel's count nobody here knows
+        if code != -signal.SIGKILL or elsewhere or oom_kills() == self.oom_kills:
             return ending(code)
         held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
         return f"{ending(code)}: the kernel was out of memory{held}"

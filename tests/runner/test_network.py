@@ -1,6 +1,7 @@
 """Hosts in graph files: what is read from them, what is refused as unsafe, and what never crosses."""
 
 import re
+import signal
 import socket
 import time
 from pathlib import Path
@@ -15,8 +16,10 @@ from runner.contract import Refused
 from runner.graph.document import Document, read_document
 from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
 from runner.graph.placement import Host, Layout, read_layout, read_owners
-from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, differences, moved
+from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, RemoteChild, differences, moved
 from runner.message.packet import Process
+from runner.process.children import spawn
+from runner.supervise.child import Child
 from runner.transport import bus
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
@@ -226,6 +229,17 @@ def test_a_host_that_stays_away_ends_what_runs_nowhere_else(tmp_path: Path):
     assert hosts.overdue({"sink": {"worker1"}}) == "host worker1 has been cut off for 60 s, and sink runs nowhere else"
     hosts._places["worker2"].hello = None
     hosts.close(0, "")
+
+
+def test_the_kernel_of_this_machine_is_not_blamed_for_a_process_on_another(tmp_path: Path):
+    log = tmp_path / "log.txt"
+    elsewhere = RemoteChild(Process("worker", 0), log, lambda _: None, lambda: None)
+    elsewhere.end(-signal.SIGKILL, "")
+    here = spawn("code", task=b"", log=log)
+    here.kill()
+    here.wait()
+    killed = [Child(Process("worker", 0), handle, log, oom_kills=-1).reason() for handle in (elsewhere, here)]
+    assert killed == ["killed by SIGKILL", "killed by SIGKILL: the kernel was out of memory"]
 
 
 @pytest.mark.parametrize("port", [None, "47447"])
