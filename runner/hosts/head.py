@@ -13,12 +13,14 @@ Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learn
 
 from __future__ import annotations
 
+import math
 import secrets
-import subprocess
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,6 +32,7 @@ from runner.graph.graph import NUMERICAL
 from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
 from runner.message.packet import Packet, Process
+from runner.process.children import Polled
 from runner.process.stage_process import Assignment
 from runner.recording.provenance import (
     fingerprint,
@@ -47,6 +50,8 @@ ABSENT_SECONDS = 60.0
 REMIND_SECONDS = 30.0
 JOIN_SECONDS = 5.0
 LEAVE_SECONDS = 3.0
+ANSWER_SECONDS = 10.0
+"""What a host may take to say that a process has gone that it was told to kill."""
 CUT_OFF = 1
 """Stands for the exit code of a process that nobody hears of any more."""
 SHOWN_DIFFERENCES = 5
@@ -118,43 +123,43 @@ def control(graph: str) -> str:
     return f"hosts/{graph}"
 
 
-class RemoteChild:
+class RemoteChild(Polled):
     """A process on another host, as the supervisor sees it: like the :class:`subprocess.Popen` of one that is here."""
 
-    def __init__(self, process: Process, log: Path, send: Callable[[Order], None]):
+    def __init__(self, process: Process, log: Path, send: Callable[[Order], None], give_up: Callable[[], None]):
+        """``give_up`` is called where its host does not say that it has gone after it was killed; it ends it."""
         self.process = process
         self.pid = 0
         """On its own host; 0 until it is there."""
         self.returncode: int | None = None
         self._log = log
         self._send = send
-        self._ended = threading.Event()
+        self._give_up = give_up
+        self._gone_by = math.inf
+        """When its host must have said that it has gone, monotonic seconds."""
         log.touch()
 
     def poll(self) -> int | None:
-        """Its exit code, None while it lives."""
+        """See :class:`Polled`."""
+        if self.returncode is None and time.monotonic() > self._gone_by:
+            self._give_up()
         return self.returncode
 
-    def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end; raises subprocess.TimeoutExpired."""
-        if not self._ended.wait(timeout):
-            raise subprocess.TimeoutExpired(self.process.path, timeout or 0.0)
-        return self.returncode or 0
-
-    def send_signal(self, signum: int) -> None:
-        """Signals this process alone."""
-        self._send(Signal(self.process, signum, group=False))
+    def send_signal(self, signum: int, *, group: bool = False) -> None:
+        """Signals this process alone, or with ``group`` everything it has started too."""
+        if signum == signal.SIGKILL:
+            self._gone_by = min(self._gone_by, time.monotonic() + ANSWER_SECONDS)
+        self._send(Signal(self.process, signum, group))
 
     def signal_group(self, signum: int) -> None:
         """Signals it and everything it has started."""
-        self._send(Signal(self.process, signum, group=True))
+        self.send_signal(signum, group=True)
 
     def end(self, code: int, output: str) -> None:
         """Takes note that it has gone; its last words are kept where those of other processes are."""
         with self._log.open("a") as log:
             log.write(output)
         self.returncode = code
-        self._ended.set()
 
 
 @dataclass(slots=True)
@@ -200,7 +205,7 @@ class Hosts:
     def start(self, host: str, process: Process, task: Assignment, log: Path) -> RemoteChild:
         """Has a process started, as soon as its host is there."""
         place = self._places[host]
-        child = RemoteChild(process, log, lambda order: self._order(place, order))
+        child = RemoteChild(process, log, partial(self._order, place), partial(self._expel, place))
         with self._changed:
             place.children[process] = child
             self._order(place, Start(process, task))
@@ -299,6 +304,13 @@ class Hosts:
         self._say(f"host {place.name} is cut off, with {len(children)} processes", "warning")
         for child in children.values():
             child.end(CUT_OFF, f"host {place.name} is cut off\n")
+
+    def _expel(self, place: _Place) -> None:
+        """Counts a host as gone that has a link and does not answer, and should it go on, has it end."""
+        reason = f"the head was not answered for {ANSWER_SECONDS:g} s; start this host again"
+        with self._changed:
+            self._order(place, Dismiss(CUT_OFF, reason))
+            self._lose(place)
 
     # ------------------------------------------------------------------------------------------ what is said
 

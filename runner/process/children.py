@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +41,8 @@ DESCENDANT_DEATH_SECONDS = 3.0
 """After that one is given up: the kernel holds it."""
 LOOK_SECONDS = 0.01
 """Between two looks for descendants. Two must find none: one that is just replaced by another program shows nothing."""
+LONGEST_PAUSE_SECONDS = 0.02
+"""Between two looks whether a process has ended."""
 SHOWN_CHARACTERS = 100
 _AFTER = "after"
 OOM_SCORE = 500
@@ -69,6 +72,24 @@ class Handle(Protocol):
     def signal_group(self, signum: int) -> None:
         """Signals it and everything it has started, also once it has gone."""
         ...
+
+
+class Polled(ABC):
+    """A process whose end is seen only by who looks."""
+
+    @abstractmethod
+    def poll(self) -> int | None:
+        """Its exit code, negative where a signal killed it; None while it lives."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Waits for its end; raises subprocess.TimeoutExpired."""
+        began, pause = time.monotonic(), 0.0005
+        while (code := self.poll()) is None:
+            if timeout is not None and time.monotonic() - began >= timeout:
+                raise subprocess.TimeoutExpired(str(self), timeout)
+            time.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
+        return code
 
 
 class Spawned(subprocess.Popen[bytes]):

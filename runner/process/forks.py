@@ -13,18 +13,15 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 from runner.contract import Refused
-from runner.process.children import DESCENT, ENVIRONMENT, PARENT, signal_group
+from runner.process.children import DESCENT, ENVIRONMENT, PARENT, Polled, signal_group
 
 EXIT_FAILED = 1
-LONGEST_PAUSE_SECONDS = 0.02
-"""Between two looks whether a process has ended."""
 ROOM = 256
 """Characters that a clean environment keeps for the mark of a process that is forked."""
 
@@ -63,7 +60,7 @@ class Threads(Refused):
     """A process cannot be forked: what its other threads hold would be held for ever."""
 
 
-class Forked:
+class Forked(Polled):
     """A child of this process that was forked, with the interface of :class:`subprocess.Popen`."""
 
     def __init__(self, pid: int) -> None:
@@ -72,22 +69,12 @@ class Forked:
         self._polling = threading.Lock()
 
     def poll(self) -> int | None:
-        """Its exit code, negative where a signal killed it; None while it lives."""
+        """See :class:`Polled`."""
         with self._polling:
             if self.returncode is None:
                 pid, status = os.waitpid(self.pid, os.WNOHANG)
                 self.returncode = os.waitstatus_to_exitcode(status) if pid else None
         return self.returncode
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end; raises subprocess.TimeoutExpired."""
-        began, pause = time.monotonic(), 0.0005
-        while (code := self.poll()) is None:
-            if timeout is not None and time.monotonic() - began >= timeout:
-                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout)
-            time.sleep(pause)
-            pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
-        return code
 
     def send_signal(self, signum: int) -> None:
         """Signals this process alone; one that has gone is no error."""

@@ -165,6 +165,22 @@ def test_hosts_end_with_their_head(parties, tmp_path: Path):
     wait_until(lambda: processes_of(tmp_path) == [])
 
 
+@pytest.mark.slow
+def test_a_host_that_stands_still_does_not_keep_the_head_from_its_end(parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.6")
+    before = read_until(party.hosts["head"], "sum")
+    party.hosts["worker1"].send_signal(signal.SIGSTOP)
+    party.hosts["head"].send_signal(signal.SIGINT)
+    head = party.end("head", before)
+    assert head.code == 130
+    assert "host worker1 is cut off, with 1 processes" in head.output
+    (lost,) = Recording(head.recording).lost
+    assert (lost.stage, lost.reason) == ("worker", "killed: not at its end after 2 s")
+    party.hosts["worker1"].send_signal(signal.SIGCONT)
+    assert "the head was not answered for 10 s; start this host again" in party.end("worker1").output
+    assert processes_of(tmp_path) == []
+
+
 def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixture[str]):
     assert main(["up", str(HOSTS)]) == 2
     assert "runs on head, worker1, worker2: say which this machine is with --host NAME" in capfd.readouterr().err
