@@ -72,10 +72,11 @@ def new_endpoint(like: str = "") -> str:
 
 
 def remove_sockets(endpoint: str) -> None:
-    """Removes the folder of an endpoint's sockets; nothing where it is an address."""
+    """Removes the folder of an endpoint's sockets; nothing where it is an address, or no folder of runs."""
     protocol, _, path = endpoint.partition("/")
-    if protocol == _UNIX:
-        shutil.rmtree(Path(path).parent, ignore_errors=True)
+    folder = Path(path).parent.resolve()
+    if protocol == _UNIX and folder.parent == runtime_folder().resolve():
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def private(endpoint: str) -> str:

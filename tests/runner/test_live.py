@@ -142,6 +142,19 @@ def test_a_run_is_listed_as_long_as_its_process_lives() -> None:
         find_run()
 
 
+@pytest.mark.usefixtures("nothing_runs")
+def test_of_a_run_that_died_its_own_sockets_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    own, foreign = new_endpoint(), tmp_path / "photos"
+    foreign.mkdir()
+    listed = (own, *(f"unixsock-stream/{path}" for path in (foreign / "1", runtime_folder() / "../1", tmp_path / "1")))
+    for number, gateway in enumerate(listed):
+        text = msgspec.json.encode(msgspec.structs.replace(entry(f"dead-{number}"), gateway=gateway))
+        (runtime_folder() / f"dead-{number}.json").write_bytes(text)
+    assert runs() == []
+    assert foreign.exists()
+    assert list(runtime_folder().iterdir()) == []
+
+
 def test_a_folder_that_others_may_enter_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "runner").mkdir(mode=0o755)
