@@ -60,17 +60,19 @@ def travel(
     """Stops at message ``until``, or where ``condition`` first holds, or with ``step`` at one message after another.
 
     A Python prompt opens where ``prompt`` says so or the terminal is a person's. Returns 1 where nothing satisfies the
-    condition. Raises Refused for a message, stage or port that does not exist.
+    condition. Raises Refused for a message, stage or port that does not exist, or where there are no messages.
     """
     recording = Recording(path)
     recording.require_messages()
+    if not recording.messages:
+        raise Refused(f"{path}: holds no messages: there is none to stop at")
     graph = change(recording, assignments, swaps)
     if until is not None:
         start = _existing(recording, until)
     elif condition is not None:
         start = first_match(recording, graph, condition)
     else:
-        start = next(iter(recording.messages), None)
+        start = next(iter(recording.messages))
     if start is None:
         print(f"{condition!r} holds for no message of {path}")
         return 1

@@ -100,6 +100,12 @@ def test_a_setting_of_a_device_is_no_obstacle(toys: Path, typed: Typed):
     assert code == 0, said
 
 
+@pytest.mark.parametrize("arguments", [["--step"], ["--until", "a.b#1"], ["--break", "counter.number.last"]])
+def test_without_messages_there_is_none_to_stop_at(tmp_path: Path, typed: Typed, arguments: list[str]):
+    empty, _ = record_toys(tmp_path, keep=lambda _: None)
+    assert typed(empty, *arguments) == (2, f"{empty}: holds no messages: there is none to stop at\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
