@@ -18,7 +18,7 @@ from runner.contract import Command, Finished, Message, Part, Refused, Restarted
 from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.packaged import locate
 from runner.graph.placement import ALONE, Layout, check_listen, read_layout, read_placement
-from runner.graph.ports import InputPort, StageType, inspect_stage, port_name
+from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_shared
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
 T = TypeVar("T")
@@ -72,7 +72,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A device's source may wait for the world as long as it likes."""
     startup: Annotated[float, Meta(gt=0, description="Seconds until a process must be ready")] = 180.0
     memory: Annotated[
-        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$")] | None,
+        Annotated[str, Meta(pattern=r"^\d+(\.\d+)? ?[kMGT]B$(?!\n)")] | None,
         Meta(description="What a process may hold, for example 2GB"),
     ] = None
 
@@ -87,7 +87,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class StageEntry(Limits, frozen=True, kw_only=True):
     """One stage of the graph."""
 
-    stage: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$", description="module:Class")]
+    stage: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$(?!\n)", description="module:Class")]
     config: Annotated[dict[str, Any], Meta(description="Settings of the stage, as its Config declares them")] = {}
     inputs: Annotated[dict[str, str | Edge], Meta(description="Input port -> stage.port")] = {}
     replicas: Annotated[
@@ -106,7 +106,7 @@ class StageEntry(Limits, frozen=True, kw_only=True):
 class GraphKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is said of a graph beside its stages and hosts."""
 
-    name: Annotated[str, Meta(pattern=r"^[\w-]+$", description="Names the recordings")]
+    name: Annotated[str, Meta(pattern=r"^[\w-]+$(?!\n)", description="Names the recordings")]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
     view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
     listen: Annotated[
@@ -349,6 +349,8 @@ def _build(document: Document) -> Graph:
     types = _collect(lambda name: _load(document, name, entries[name]), names)
     _resolve_settings(document, entries, types)
     nodes = _collect(lambda name: _node(document, name, entries[name], types[name]), names)
+    commands = ((command_port(name, port), f"{name}.{port}") for name in names for port in types[name].commands)
+    refuse_shared(f"{document.place('stages')}: commands", commands)
     layout = read_layout(document)
     check_listen(document, layout)
     graph = Graph(**keys, nodes=nodes, layout=layout)

@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -80,10 +80,20 @@ def inspect_stage(cls: type[Stage]) -> StageType:
         raise Refused(f"{cls.__name__}.source: only a stage marked `device = True` may be a source")
     if not handlers and source is None:
         raise Refused(f"{cls.__name__}: has no handlers; a handler is a method named on_*")
-    _refuse_shared_ports(cls, handlers)
+    refuse_shared(cls.__name__, ((port.name, handler.name) for handler in handlers for port in handler.inputs))
     methods = [handler.name for handler in handlers] + (["source"] if source else [])
-    outputs = {port_name(kind): kind for name in methods for kind in _message_types(_hints(cls, name)["return"])}
+    emitted = [kind for name in methods for kind in _message_types(_hints(cls, name)["return"])]
+    refuse_shared(cls.__name__, ((port_name(kind), f"{kind.__module__}:{kind.__qualname__}") for kind in emitted))
+    outputs = {port_name(kind): kind for kind in emitted}
     return StageType(cls, handlers, source, outputs, _config_type(cls))
+
+
+def refuse_shared(place: str, ports: Iterable[tuple[str, str]]) -> None:
+    """Raises Refused where two owners have a port of one name; ``ports`` are (port, owner)."""
+    owners: dict[str, str] = {}
+    for port, owner in ports:
+        if (other := owners.setdefault(port, owner)) != owner:
+            raise Refused(f"{place}: {other} and {owner} would share the port {port!r}; rename one of them")
 
 
 @cache
@@ -147,15 +157,6 @@ def _refuse_inputs(cls: type[Stage], method: str, inputs: list[InputPort]) -> No
     for port in inputs:  # nothing else hangs on a command: a join with one would wait for ever
         if issubclass(port.type, Command) and len(inputs) > 1:
             raise Refused(f"{cls.__name__}.{method}({port.name}): a command is the only message its handler takes")
-
-
-def _refuse_shared_ports(cls: type[Stage], handlers: tuple[Handler, ...]) -> None:
-    owners: dict[str, str] = {}
-    for handler in handlers:
-        for port in handler.inputs:
-            other = owners.setdefault(port.name, handler.name)
-            if other != handler.name:
-                raise Refused(f"{cls.__name__}.{handler.name}({port.name}): {other} takes the port of that name too")
 
 
 def _message_types(annotation: Any) -> Iterator[type[Message]]:

@@ -25,7 +25,7 @@ class Process:
     @staticmethod
     def of(key: str) -> Process:
         """The process that a key ends with; raises Refused where it names none."""
-        match = re.search(r"(?:^|/)([^/]+)/([0-9]{1,9})/([0-9]{1,9})$", key)
+        match = re.search(r"(?:^|/)([^/]+)/([0-9]{1,9})/([0-9]{1,9})\Z", key)
         if match is None:
             raise Refused(f"names no process: {key[-60:]}; valid: STAGE/REPLICA/INCARNATION")
         return Process(match[1], int(match[2]), int(match[3]))

@@ -165,6 +165,36 @@ def test_a_value_that_must_be_set_says_how(tmp_path: Path):
         load(tmp_path)
 
 
+class Bank(Stage):
+    def on_add(self, add: Add) -> None: ...
+
+
+class Tills(Stage):
+    def on_till_add(self, till_add: Add) -> None: ...
+
+
+def test_commands_that_would_share_a_port_are_refused(tmp_path: Path):
+    stages = {"bank": {"stage": f"{__name__}:Tills"}, "bank_till": {"stage": f"{__name__}:Bank"}}
+    path = tmp_path / "graph.yaml"
+    path.write_text(yaml.safe_dump({"name": "banks", "stages": stages}))
+    said = r":2: stages: commands: bank.till_add and bank_till.add would share the port 'bank_till_add'; rename one"
+    with pytest.raises(Refused, match=said):
+        load_graph(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("name: toys", 'name: "toys\\n"', "name"),
+        ("tests.runner.toys:Sink", '"tests.runner.toys:Sink\\n"', "stages.sink.stage"),
+        ("replicas: 2", 'memory: "2GB\\n"', "stages.worker.memory"),
+    ],
+)
+def test_a_name_ends_where_its_line_does(tmp_path: Path, old: str, new: str, place: str):
+    with pytest.raises(Refused, match=f"{place}: Expected `str` matching regex"):
+        load(tmp_path, OUT, old=old, new=new)
+
+
 def test_all_mistakes_of_a_kind_are_named_at_once(tmp_path: Path):
     with pytest.raises(Refused) as caught:
         load(tmp_path, OUT, "counter.cont=1", "worker.secs=1")

@@ -3,7 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runner.contract import Refused
 from runner.message.ids import IdText, MessageId
+from runner.message.packet import Process
 
 names = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
 ids = st.builds(MessageId, names, names, st.integers(0, 10**15 - 1))
@@ -34,6 +36,13 @@ def test_ids_are_sorted_by_port_and_number():
 )
 def test_what_is_malformed_is_empty(text: str, parts: tuple[str, str, int]):
     assert MessageId.of(text) == MessageId(*parts)
+
+
+@pytest.mark.parametrize("key", ["", "camera/0", "camera/0/1\n", "camera/0/x", "h/0/1/camera"])
+def test_a_key_that_ends_with_no_process_is_refused(key: str):
+    assert Process.of(f"run/present/{Process('camera', 0, 1).path}") == Process("camera", 0, 1)
+    with pytest.raises(Refused, match="names no process"):
+        Process.of(key)
 
 
 @given(st.text())

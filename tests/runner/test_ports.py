@@ -77,6 +77,13 @@ class SharedPort(Stage):
     def on_second(self, number: Number, double: Double) -> None: ...
 
 
+class TOTAL(Number, frozen=True): ...
+
+
+class TwoTotals(Stage):
+    def on_number(self, number: Number) -> Total | TOTAL: ...
+
+
 class NotADevice(Stage):
     def source(self, ctx: Context) -> Iterator[Number]: ...
 
@@ -101,7 +108,8 @@ class MutableConfig(Stage):
         (ListOfWhole, r"ListOfWhole.on_numbers\(numbers\): a list gathers Parts, and Number is not one"),
         (CommandJoined, r"CommandJoined.on_add\(add\): a command is the only message its handler takes"),
         (TwoParts, r"TwoParts.on_parts\(piece, answer\): a handler takes at most one Part"),
-        (SharedPort, r"SharedPort.on_second\(number\): on_first takes the port of that name too"),
+        (SharedPort, "SharedPort: on_first and on_second would share the port 'number'; rename one of them"),
+        (TwoTotals, "TwoTotals: tests.runner.toys:Total and .*:TOTAL would share the port 'total'; rename one of them"),
         (NotADevice, "NotADevice.source: only a stage marked `device = True`"),
         (Empty, "Empty: has no handlers"),
         (MutableConfig, "MutableConfig.Config: must be a frozen dataclass"),
