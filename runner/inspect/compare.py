@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.message.codec import Fields
+from runner.contract import Message
+from runner.message.codec import CodecError, Envelope, Fields, decode, decode_untyped
 
 SHOWN = 60
 """Characters of a value that are shown."""
@@ -64,9 +65,33 @@ def differences(recorded: Any, replayed: Any, field: str = "", owner: str = "") 
         yield Difference(field, _show(recorded), _show(replayed), largest=_gap(recorded, replayed), owner=owner)
 
 
+def envelope_differences(
+    recorded: Envelope, replayed: Envelope, header: Iterable[str], kind: type[Message] | None = None
+) -> Differences:
+    """Every difference of two messages, those of ``header`` first; their fields are those of ``kind`` if it can read
+    both, else those that are there."""
+    for name in header:
+        yield from differences(getattr(recorded, name), getattr(replayed, name), name)
+    if bytes(recorded.body) != bytes(replayed.body):
+        yield from _body_differences(recorded, replayed, kind)
+
+
+def _body_differences(recorded: Envelope, replayed: Envelope, kind: type[Message] | None) -> Differences:
+    try:
+        first, second = (decode(kind, one.body) if kind else decode_untyped(one.body) for one in (recorded, replayed))
+    except CodecError as error:
+        if kind:
+            yield from _body_differences(recorded, replayed, None)
+        else:
+            yield Difference("body", "", "", f"cannot be read: {error}")
+    else:
+        yield from differences(first, second)
+
+
 def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str, owner: str) -> Differences:
     if recorded.keys() != replayed.keys():
-        yield Difference(field, _show(sorted(recorded)), _show(sorted(replayed)), "keys differ", owner=owner)
+        keys = _show(sorted(recorded)), _show(sorted(replayed))
+        yield Difference(field or "fields", *keys, "keys differ", owner=owner)
     for key in filter(replayed.__contains__, recorded):
         place = f"{field}.{key}".lstrip(".") if isinstance(recorded, Fields) else f"{field}[{key!r}]"
         yield from differences(recorded[key], replayed[key], place, owner)

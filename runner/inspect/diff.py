@@ -6,10 +6,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from runner.inspect.compare import Difference, differences
+from runner.inspect.compare import Difference, envelope_differences
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
-from runner.message.codec import CodecError, Envelope, decode_untyped
 from runner.message.ids import MessageId
 from runner.recording.provenance import changed_packages
 from runner.recording.recording import Recording
@@ -42,22 +41,10 @@ def _found(first: Recording, second: Recording, summary: Summary) -> Iterator[st
         if id not in second.messages:
             yield f"{id}: only in {first.path}"
             continue
-        changes = list(message_differences(first.recorded(id), second.recorded(id)))
+        changes = list(envelope_differences(first.recorded(id), second.recorded(id), HEADER))
         if summary.add(MessageId.of(id).topic, id, changes):
             yield f"{id}: {_words(changes[0])}"
     yield from (f"{id}: only in {second.path}" for id in second.messages if id not in first.messages)
-
-
-def message_differences(first: Envelope, second: Envelope) -> Iterator[Difference]:
-    """Every header and field that differs, without the need of the message's class."""
-    for name in HEADER:
-        yield from differences(getattr(first, name), getattr(second, name), name)
-    if bytes(first.body) == bytes(second.body):
-        return
-    try:
-        yield from differences(decode_untyped(first.body), decode_untyped(second.body))
-    except CodecError as error:
-        yield Difference("body", "", "", f"cannot be read: {error}")
 
 
 def _words(difference: Difference) -> str:

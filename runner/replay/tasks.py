@@ -15,9 +15,9 @@ import msgspec
 from runner.contract import Message, Refused, Tolerances
 from runner.graph.graph import SUPERVISOR, Graph, Node
 from runner.graph.ports import Handler
-from runner.inspect.compare import Difference, differences
+from runner.inspect.compare import envelope_differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, decode, open_envelope, pack
+from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
@@ -25,6 +25,7 @@ from runner.recording.recording import Recording, replicated
 from runner.replay.tolerances import outside
 
 HEADER = tuple(name for name in Envelope.__struct_fields__ if name != "body")
+"""What is compared of a message beside its fields."""
 
 
 class Task(msgspec.Struct, frozen=True):
@@ -226,10 +227,7 @@ class Comparison:
         if other is None:
             return ""
         kind = self._node.type.outputs.get(MessageId.of(id).port)
-        try:
-            found = list(envelope_differences(kind, recorded, other))
-        except CodecError as error:
-            return f"the recorded message cannot be read: {error}"
+        found = list(envelope_differences(recorded, other, HEADER, kind))
         self._summary.add(MessageId.of(id).topic, id, found)
         beyond = next(outside(found, self._tolerances), None)
         if beyond is None and found and self._tolerances:
@@ -258,14 +256,6 @@ def what_differs(recorded: Envelope, replayed: Envelope) -> Envelope | None:
         return None
     replayed = without_gained_fields(recorded, replayed)
     return None if pack(recorded) == pack(replayed) else replayed
-
-
-def envelope_differences(kind: type[Message] | None, recorded: Envelope, replayed: Envelope) -> Iterator[Difference]:
-    """Every difference of two messages, headers first; raises CodecError where a body cannot be read."""
-    for name in HEADER:
-        yield from differences(getattr(recorded, name), getattr(replayed, name), name)
-    if kind is not None and bytes(recorded.body) != bytes(replayed.body):
-        yield from differences(decode(kind, recorded.body), decode(kind, replayed.body))
 
 
 def kind_of(graph: Graph, id: str) -> type[Message] | None:

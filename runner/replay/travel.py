@@ -20,7 +20,7 @@ from runner.contract import Message, Refused, Stage
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
-from runner.inspect.compare import clipped
+from runner.inspect.compare import clipped, envelope_differences
 from runner.inspect.echo import array_text
 from runner.inspect.info import table
 from runner.message.codec import Envelope, Step
@@ -30,10 +30,10 @@ from runner.recording.recording import Recording, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
 from runner.replay.tasks import (
+    HEADER,
     Execution,
     Reexecution,
     Task,
-    envelope_differences,
     kind_of,
     opened,
     process_of,
@@ -196,7 +196,7 @@ class Traveller:
             yield "executed again: identical to the recording"
         else:
             kind = kind_of(self._graph, recorded.id)
-            found = [str(difference) for difference in envelope_differences(kind, recorded, other)]
+            found = [str(difference) for difference in envelope_differences(recorded, other, HEADER, kind)]
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]
 

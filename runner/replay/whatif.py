@@ -13,6 +13,7 @@ from runner.contract import Message, Refused, Scorer
 from runner.graph.document import suggest
 from runner.graph.graph import Graph, node_entry
 from runner.graph.references import load_class
+from runner.inspect.compare import envelope_differences
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import Envelope
@@ -20,7 +21,7 @@ from runner.message.ids import MessageId
 from runner.recording.recording import Recording
 from runner.replay.partial import PartialReplay
 from runner.replay.replay import change
-from runner.replay.tasks import envelope_differences, kind_of, opened, what_differs
+from runner.replay.tasks import HEADER, kind_of, opened, what_differs
 from runner.replay.tolerances import compare_origin
 
 SHOWN = 5
@@ -117,7 +118,7 @@ def effects_of(
         before = recording.envelope(id)
         now = what_differs(before, emitted[id])
         effects["identical" if now is None else "changed"].append(id)
-        found = () if now is None else envelope_differences(kind_of(graph, id), before, now)
+        found = () if now is None else envelope_differences(before, now, HEADER, kind_of(graph, id))
         summary.add(MessageId.of(id).topic, id, found)
     effects["appeared"] += (id for id in emitted if id not in recording.messages)
     return effects, summary
@@ -174,7 +175,7 @@ def _scores(recording: Recording, graph: Graph, names: Collection[str], replay: 
         return
     cls = load_class(graph.score, f"score of graph {graph.name!r}")
     scorer = cast("Scorer", cls({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
-    before = scorer.score(_messages(graph, recording.envelopes()))
+    before = scorer.score(_messages(change(recording), recording.envelopes()))
     now = scorer.score(_messages(graph, _new_run(recording, names, replay)))
     rows = [_score_row(name, before.get(name), now.get(name)) for name in {**before, **now}]
     yield from table(("score", "recorded", "now", "change"), rows) or ["no score: the recording holds nothing to score"]

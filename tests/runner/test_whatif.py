@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,12 +10,20 @@ import pytest
 
 from runner.cli.main import main
 from runner.contract import Message
+from runner.graph.graph import load_graph
 from runner.message.codec import decode
 from runner.process.children import ENVIRONMENT
 from runner.recording.recording import Recording
-from tests.runner.recordings import record_toys
+from tests.runner.recordings import ToyRun, record, record_toys
 from tests.runner.test_replay import replay
-from tests.runner.toys import Answer, Gatherer, Number, Total
+from tests.runner.toys import Answer, Doubler, Gatherer, Number, Total
+
+DOUBLES = """
+name: doubles
+stages:
+  counter: {stage: tests.runner.toys:Counter}
+  doubler: {stage: tests.runner.toys:Doubler, inputs: {number: counter.number}}
+"""
 
 
 class Louder(Gatherer):
@@ -57,6 +66,28 @@ class Sum:
 
     def score(self, run: Iterator[tuple[str, Message]]) -> dict[str, float]:
         return {"sum": sum(float(message.samples.sum()) for _, message in run if isinstance(message, Total))}
+
+
+class Double(Message, frozen=True):
+    """Another class of the name that is recorded."""
+
+    text: str
+
+
+class Writer(Doubler):
+    """Says in words what a doubler says in numbers."""
+
+    def on_number(self, number: Number) -> Double:
+        return Double(text=f"twice {number.value}")
+
+
+class Count:
+    """Scores what doublers say."""
+
+    def __init__(self, settings: dict[str, object]) -> None: ...
+
+    def score(self, run: Iterator[tuple[str, Message]]) -> dict[str, float]:
+        return dict(Counter(type(message).__module__ for _, message in run))
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +147,23 @@ def largest_samples(path: Path) -> Iterator[float]:
     for id in recording.messages:
         if id.startswith("gatherer.total#"):
             yield float(decode(Total, recording.envelope(id).body).samples.max())
+
+
+def test_messages_of_another_class_have_changed(tmp_path: Path):
+    """Nobody consumes them: the graph is as good as before."""
+    file = tmp_path / "doubles.yaml"
+    file.write_text(DOUBLES)
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "doubles.mcap", ToyRun(graph, tmp_path).records())
+    swap = ("--swap", f"doubler={__name__}:Writer")
+    code, said = replay(path, *swap, "--set", f"score={__name__}:Count")
+    assert code == 0, said
+    assert row(said, "doubler/double") == ["-", "5", "-", "-"]
+    assert "doubler/double  fields    5 of 5        -  doubler.double#0" in said
+    assert (row(said, "tests.runner.toys"), row(said, __name__)) == (["10", "5", "-5"], ["-", "5", "-"])
+    code, said = replay(path, *swap, "--until", "doubler.double#1")
+    assert code == 0, said
+    assert "differ from the recording" in said
 
 
 def test_what_a_handler_raises_is_named_and_its_message_vanishes(toys: Path):
