@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import struct
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
@@ -142,6 +143,26 @@ def open_file(path: Path) -> IO[bytes]:
         raise Refused(f"{path}: no such file; {_beside(path.parent)}") from None
     except OSError as error:
         raise Refused(f"{path}: cannot be read: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Generator[IO[bytes]]:
+    """A file to write that has its name only once all of it is written; a kill leaves ``PATH.part``.
+
+    Raises Refused where the name is taken or writing fails.
+    """
+    part = path.with_name(f"{path.name}.part")
+    try:
+        if path.exists():
+            raise Refused(f"{path}: cannot be written: File exists")
+        with part.open("wb") as file:
+            yield file
+        part.rename(path)
+    except OSError as error:
+        raise Refused(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
 
 
 def _beside(folder: Path) -> str:

@@ -6,7 +6,7 @@ from typing import IO
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Refused
-from runner.recording.container import Container, Entry, is_being_written, open_file
+from runner.recording.container import Container, Entry, is_being_written, new_file, open_file
 from runner.recording.recording import PROFILE, VERDICT, Recording
 from runner.recording.writer import CHUNK_BYTES
 
@@ -24,11 +24,8 @@ def recover(path: Path, target: Path | None = None) -> tuple[Recording, Path]:
         if is_being_written(file):
             raise Refused(f"{path}: is still being written; valid: the recording of a graph that has ended")
     recording = Recording(path)
-    try:
-        with target.open("xb") as output:
-            _copy(recording, output)
-    except OSError as error:
-        raise Refused(f"{target}: cannot be written: {error.strerror}") from None
+    with new_file(target) as output:
+        _copy(recording, output)
     return recording, target
 
 

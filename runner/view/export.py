@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import LogLine
+from runner.recording.container import new_file
 from runner.recording.recording import Recording
 from runner.view import drawing as d
 from runner.view.views import drawn, load_views
@@ -54,15 +55,12 @@ def export(path: Path, target: Path) -> list[str]:
     recording = Recording(path)
     graph = graph_from_json(recording.run["graph"], str(path))
     views = load_views(graph)
-    try:
-        with target.open("xb") as output:
-            sink = _Sink(Writer(output, compression=CompressionType.ZSTD))
-            for line in recording.log:
-                sink.put([(LOGS, _log_line(line))], line.time_ns)
-            _write_drawings(recording, graph, views, sink)
-            sink.finish()
-    except OSError as error:
-        raise Refused(f"{target}: cannot be written: {error.strerror}") from None
+    with new_file(target) as output:
+        sink = _Sink(Writer(output, compression=CompressionType.ZSTD))
+        for line in recording.log:
+            sink.put([(LOGS, _log_line(line))], line.time_ns)
+        _write_drawings(recording, graph, views, sink)
+        sink.finish()
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(sink.counts.items()))
     return [f"{path}: {recording.verdict}", f"{target}: {kinds or 'nothing to show'}"]
 

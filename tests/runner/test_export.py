@@ -1,7 +1,12 @@
 """What `runner export --foxglove` writes, read back by the decoders of others."""
 
 import io
+import os
+import resource
+import signal
 import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +17,15 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from runner.cli.main import main
-from runner.contract import Refused
+from runner.contract import Message, Refused
 from runner.message.codec import LogLine
+from runner.recording.recover import recover
 from runner.view import drawing as d
 from runner.view.export import _Scribe, _Sink, export
 from runner.view.rerun_view import RERUN
 from tests.runner.recordings import record_toys
-from tests.runner.toy_views import BOXES, DEPTH, FACES, IMAGE, TETRAHEDRON
+from tests.runner.toy_views import BOXES, DEPTH, FACES, IMAGE, TETRAHEDRON, ToyViews
+from tests.runner.toys import Number
 
 VIEW = "view=tests.runner.toy_views:ToyViews"
 
@@ -117,6 +124,35 @@ def test_rerun_opens_it(exported: Path, tmp_path: Path):
     text = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
     for path, component in (("/camera", "Image:buffer"), ("/tf", "Transform3D:"), ("/world/points", "Points3D:")):
         assert any(f" - {path} - " in line and component in line for line in text.splitlines()), path
+
+
+class Deadly(ToyViews):
+    """Kills whoever draws the last number."""
+
+    def draw(self, message: Message) -> Iterator[d.Drawing]:
+        if isinstance(message, Number) and message.last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().draw(message)
+
+
+def test_who_is_killed_leaves_no_file_that_looks_whole(tmp_path: Path):
+    path, _ = record_toys(tmp_path, f"view={__name__}:Deadly")
+    command = [sys.executable, "-m", "runner.cli", "export", str(path), "--foxglove", str(tmp_path / "out.mcap")]
+    assert subprocess.run(command, check=False, timeout=60).returncode == -signal.SIGKILL
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_full_disk_leaves_no_file(tmp_path: Path):
+    path, _ = record_toys(tmp_path, VIEW)
+    before, soft, hard = set(tmp_path.iterdir()), *resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        for write in (export, recover):
+            with pytest.raises(Refused, match=r"out\.mcap: cannot be written: File too large"):
+                write(path, tmp_path / "out.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert set(tmp_path.iterdir()) == before
 
 
 def test_refuses_to_overwrite_and_a_graph_without_views(exported: Path, tmp_path: Path):
