@@ -14,7 +14,7 @@ import pytest
 
 from runner.message.codec import pack
 from runner.recording.recording import Recording
-from tests.runner.test_bad_input import public_address, stranger
+from tests.runner.transport.test_bad_input import public_address, stranger
 
 ROOT = Path(__file__).parent.parent
 RUNNER = (sys.executable, "-m", "runner.cli")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runner.test_runs import read_until
+from runner.testing import read_until
 
 ROOT = Path(__file__).parent.parent
 RUNNER = (sys.executable, "-m", "runner.cli")

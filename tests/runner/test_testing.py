@@ -13,8 +13,9 @@ from runner.message.codec import CodecError, decode
 from runner.process.step import BrokenContract, step_seed
 from runner.recording.recording import Recording
 from runner.testing import read_until, run_graph, run_stage, start_graph
-from tests.runner.recordings import TOYS, record_toys
-from tests.runner.toys import (
+from tests.runner.common.recordings import TOYS, record_toys
+from tests.runner.common.runs import DOUBLES
+from tests.runner.common.toys import (
     Account,
     Add,
     Answer,
@@ -29,8 +30,6 @@ from tests.runner.toys import (
     Total,
     Worker,
 )
-
-DOUBLES = Path(__file__).with_name("doubles.yaml")
 
 
 def answer(index: int, value: float, count: int = 2) -> Answer:
@@ -157,7 +156,7 @@ TEXT = """
 name: waiting
 stages:
   counter:
-    stage: tests.runner.toys:Counter
+    stage: tests.runner.common.toys:Counter
     config: {count: 100000, period: 0.01}
 """
 

@@ -17,7 +17,7 @@ from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, Simula
 from stages.devices import fetch
 from stages.devices.tabletop import TABLE
 from stages.messages import Frame, Snapshot
-from tests.runner.recordings import manifest, put
+from tests.runner.common.recordings import manifest, put
 
 BUILT_IN = Path(stages.scene.__file__).parent / "catalogue.yaml"
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -1,0 +1,312 @@
+"""Graphs on several hosts: the same bytes as on one, whoever strays in and whoever is cut off."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from runner.cli.main import main
+from runner.graph.placement import Host
+from runner.hosts.keys import make_keys
+from runner.recording.recording import Recording
+from runner.testing import read_until
+from tests.runner.common.machines import (
+    HOSTS,
+    NAMES,
+    Machines,
+    Party,
+    free_address,
+    in_namespaces,
+    on_loopback,
+    run_here,
+)
+from tests.runner.common.runs import Run, changed, processes_of
+from tests.runner.common.waiting import wait_until
+
+SUMS = """
+name: sums
+hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1}
+stages:
+  counter:
+    stage: tests.runner.common.toys:Counter
+  adder:
+    stage: tests.runner.common.survivors:Adder
+    config:
+      marks: ???
+    inputs: {number: counter.number}
+    host: worker1
+  sink:
+    stage: tests.runner.common.toys:DoubleSink
+    config:
+      path: ???
+    inputs: {double: adder.double}
+"""
+SLOW_PIECES = ("worker.seconds=0.3",)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return run_here(tmp_path_factory.mktemp("here"))
+
+
+@pytest.fixture(scope="module")
+def namespaces() -> Iterator[Machines]:
+    with in_namespaces() as machines:
+        yield machines
+
+
+@pytest.fixture
+def parties() -> Iterator[Callable[..., Party]]:
+    made: list[Party] = []
+
+    def make(machines: Machines, folder: Path, options: tuple[str, ...] = (), graph: Path = HOSTS) -> Party:
+        made.append(Party(machines, folder, options, graph))
+        return made[-1]
+
+    yield make
+    for party in made:
+        party.close()
+
+
+def with_keys(machines: Machines, folder: Path) -> tuple[str, ...]:
+    """Makes keys for the machines; the options that turn them on."""
+    addresses = {name: machines.addresses.get(name, "127.0.0.1").partition(":")[0] for name in NAMES}
+    make_keys(folder, [Host(name, address) for name, address in addresses.items()])
+    return ("--set", f"keys={folder}")
+
+
+def bodies(finished: Run) -> dict[str, bytes]:
+    """Every message of the stages."""
+    envelopes = Recording(finished.recording).envelopes()
+    return {sealed.id: bytes(sealed.body) for sealed in envelopes if not sealed.id.startswith("supervisor.")}
+
+
+def assert_same_result(head: Run, here: Run) -> None:
+    assert head.code == 0, head.output
+    assert Recording(head.recording).verdict.complete
+    assert (head.folder.parent / "out.txt").read_text() == (here.folder / "out.txt").read_text()
+    assert bodies(head) == bodies(here)
+
+
+# ---------------------------------------------------------------------------------------------- on loopback
+
+
+def test_three_hosts_with_keys_give_the_bytes_of_one(here: Run, parties, tmp_path: Path):
+    machines = on_loopback()
+    party = parties(machines, tmp_path, with_keys(machines, tmp_path / "keys"))
+    party.start_all()
+    head = party.end("head")
+    assert_same_result(head, here)
+    workers = [party.end(name) for name in NAMES[1:]]
+    assert [(worker.code, worker.output.splitlines()[-1]) for worker in workers] == [(0, "all totals written")] * 2
+    assert "starts gatherer.0" in workers[1].output
+    assert processes_of(tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [(), ("--set", "router=head")], ids=["direct", "routed"])
+def test_hosts_may_be_started_in_any_order_without_keys_on_loopback(here: Run, parties, tmp_path: Path, options):
+    party = parties(on_loopback(), tmp_path, options)
+    for name in reversed(NAMES):
+        party.start(name)
+    assert_same_result(party.end("head"), here)
+
+
+@pytest.mark.slow
+def test_the_head_says_whom_it_waits_for(parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path)
+    head = party.start("head")
+    seen = read_until(head, "waiting for host worker2")
+    assert f"waiting for host worker1: runner up {HOSTS} --host worker1" in seen
+    os.kill(head.pid, signal.SIGINT)
+    assert party.end("head").code == 130
+
+
+@pytest.mark.slow
+def test_a_host_with_another_graph_is_refused_with_the_difference(parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path)
+    party.start("head")
+    other = tmp_path / "other.yaml"
+    other.write_text(HOSTS.read_text().replace("seed: 7", "seed: 8"))
+    party.hosts["worker1"] = party.machines.start("worker1", tmp_path, graph=other)
+    refused = party.end("worker1")
+    assert refused.code == 2
+    assert "host worker1 has another graph: seed: 8 at worker1, 7 at the head" in refused.output
+    party.start("worker1")
+    party.start("worker2")
+    assert party.end("head").code == 0
+
+
+@pytest.mark.slow
+def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path).start_all(*SLOW_PIECES)
+    before = read_until(party.hosts["head"], "sum")
+    party.hosts["worker1"].kill()
+    head = party.end("head", before)
+    assert "host worker1 is cut off, with 1 processes" in head.output
+    assert_same_result(head, here)
+    assert processes_of(tmp_path / "worker1") == []
+
+
+@pytest.mark.slow
+def test_a_host_that_is_started_again_takes_part_again(here: Run, parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.6")
+    before = read_until(party.hosts["head"], "sum")
+    party.hosts["worker1"].kill()
+    before += read_until(party.hosts["head"], "is cut off")
+    party.hosts.pop("worker1").communicate()
+    party.start("worker1")
+    head = party.end("head", before)
+    assert "host worker1 is back" in head.output
+    assert_same_result(head, here)
+
+
+@pytest.mark.slow
+def test_hosts_end_with_their_head(parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path).start_all(*SLOW_PIECES)
+    read_until(party.hosts["head"], "processes are ready")
+    party.hosts["head"].kill()
+    for name in NAMES[1:]:
+        ended = party.end(name)
+        assert (ended.code, "the connection to head is gone" in ended.output) == (1, True), ended.output
+    wait_until(lambda: processes_of(tmp_path) == [])
+
+
+@pytest.mark.slow
+def test_a_host_that_stands_still_does_not_keep_the_head_from_its_end(parties, tmp_path: Path):
+    party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.6")
+    before = read_until(party.hosts["head"], "sum")
+    party.hosts["worker1"].send_signal(signal.SIGSTOP)
+    party.hosts["head"].send_signal(signal.SIGINT)
+    head = party.end("head", before)
+    assert head.code == 130
+    assert "host worker1 is cut off, with 1 processes" in head.output
+    (lost,) = Recording(head.recording).lost
+    assert (lost.stage, lost.reason) == ("worker", "killed: not at its end after 2 s")
+    party.hosts["worker1"].send_signal(signal.SIGCONT)
+    assert "the head was not answered for 10 s; start this host again" in party.end("worker1").output
+    assert processes_of(tmp_path) == []
+
+
+def test_a_graph_of_several_hosts_asks_which_this_is(capfd: pytest.CaptureFixture[str]):
+    assert main(["up", str(HOSTS)]) == 2
+    assert "runs on head, worker1, worker2: say which this machine is with --host NAME" in capfd.readouterr().err
+    assert main(["up", str(HOSTS), "--host", "wrker1"]) == 2
+    assert "no such host; did you mean 'worker1'?" in capfd.readouterr().err
+    assert main(["up", str(HOSTS), "--host", "worker1", "--set", "seed=8"]) == 2
+    assert "settings are the head's" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_stateful_stage_gets_its_state_back_on_its_host(parties, tmp_path: Path):
+    graph = tmp_path / "sums.yaml"
+    graph.write_text(SUMS)
+    results: list[str] = []
+    for folder, deaths in ((tmp_path / "plain", "[]"), (tmp_path / "killed", "[2, 3]")):
+        folder.mkdir()
+        party = parties(on_loopback(), folder, graph=graph)
+        party.start("head", f"adder.marks={folder}", f"adder.die_at={deaths}")
+        party.start("worker1")
+        head = party.end("head")
+        assert head.code == 0, head.output
+        results.append((folder / "out.txt").read_text())
+    assert (results[0], head.output.count("adder restarts")) == (results[1], 2)
+
+
+@pytest.mark.slow
+def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_path: Path):
+    """Killed between what it journals and what it sends, again and again: the replicas of each host get all parts."""
+    graph = changed(HOSTS, tmp_path, Splitter="FragileSplitter")
+    results: list[str] = []
+    for name in ("calm", "rough"):
+        folder = tmp_path / name
+        folder.mkdir()
+        if name == "calm":
+            for number in range(20):
+                (folder / str(number)).touch()
+        party = parties(on_loopback(), folder, graph=graph)
+        party.start_all("counter.count=20", f"splitter.marks={folder}", "splitter.restarts=20")
+        head = party.end("head")
+        assert head.code == 0, head.output
+        assert Recording(head.recording).verdict.complete
+        results.append((folder / "out.txt").read_text())
+    assert (results[0], head.output.count("splitter restarts (")) == (results[1], 10)
+
+
+@pytest.mark.slow
+def test_a_process_elsewhere_is_explained_by_what_it_said_itself(parties, tmp_path: Path):
+    graph = tmp_path / "graph.yaml"
+    text = HOSTS.read_text().replace("toys:Worker", "survivors:Troubled")
+    graph.write_text(text.replace("{worker1: 1, worker2: 1}", "worker1"))
+    party = parties(on_loopback(), tmp_path, graph=graph)
+    party.start_all(f"worker.marks={tmp_path}", "worker.crash_at=0", "worker.exit_at=1")
+    head = party.end("head")
+    assert "worker restarts (1 of 3): killed by SIGSEGV" in head.output, head.output
+    assert "worker restarts (2 of 3): ended with exit code 3" in head.output, head.output
+    assert head.output.count("| Fatal Python error") == 1
+
+
+@pytest.mark.slow
+def test_hosts_meet_at_a_router_that_is_none_of_them(here: Run, parties, tmp_path: Path):
+    graph, endpoint = tmp_path / "graph.yaml", free_address()
+    graph.write_text(f"router: {endpoint}\n{HOSTS.read_text()}")
+    assert main(["keys", "init", str(graph)]) == 0
+    router = zenoh.open(zenoh.Config.from_file(str(tmp_path / "keys" / "router" / "zenohd.json5")))
+    party = parties(on_loopback(), tmp_path, ("--set", f"keys={tmp_path / 'keys'}"), graph=graph).start_all()
+    assert_same_result(party.end("head"), here)
+    router.close()
+
+
+# ---------------------------------------------------------------------------------------------- in namespaces
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("router", [(), ("--set", "router=head")], ids=["direct", "routed"])
+def test_three_machines_with_keys_give_the_bytes_of_one(here, namespaces, parties, tmp_path: Path, router):
+    options = (*with_keys(namespaces, tmp_path / "keys"), *router)
+    party = parties(namespaces, tmp_path, options).start_all()
+    head = party.end("head")
+    assert_same_result(head, here)
+    steps = Recording(head.recording).steps
+    assert not any(step.travelled_ns for step in steps if step.stage == "worker")  # clocks of two are not compared
+    assert any(step.travelled_ns for step in steps if step.stage != "worker")
+    assert [party.end(name).code for name in NAMES[1:]] == [0, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("router", [(), ("--set", "router=head")], ids=["direct", "routed"])
+def test_a_machine_that_is_cut_off_in_mid_frame_loses_nothing(here, namespaces, parties, tmp_path: Path, router):
+    options = (*with_keys(namespaces, tmp_path / "keys"), *router)
+    party = parties(namespaces, tmp_path, options).start_all(*SLOW_PIECES)
+    before = read_until(party.hosts["head"], "sum")
+    namespaces.cut("worker1")
+    try:
+        head = party.end("head", before)
+        worker = party.end("worker1")
+    finally:
+        namespaces.mend("worker1")
+    assert "host worker1 is cut off, with 1 processes" in head.output
+    assert_same_result(head, here)
+    assert (worker.code, "the connection to head is gone" in worker.output) == (1, True), worker.output
+    assert processes_of(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_a_machine_that_comes_back_disturbs_nobody(here, namespaces, parties, tmp_path: Path):
+    party = parties(namespaces, tmp_path, with_keys(namespaces, tmp_path / "keys"))
+    party.start_all("worker.seconds=1.2")
+    before = read_until(party.hosts["head"], "sum")
+    namespaces.cut("worker1")
+    before += read_until(party.hosts["head"], "host worker1 is cut off")
+    namespaces.mend("worker1")
+    cut_off = party.hosts.pop("worker1")
+    party.start("worker1")
+    head = party.end("head", before)
+    assert "host worker1 is back" in head.output
+    assert_same_result(head, here)
+    assert cut_off.wait(60) == 1
+    cut_off.communicate()
+    assert processes_of(tmp_path) == []

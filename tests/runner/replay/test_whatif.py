@@ -1,0 +1,221 @@
+"""Changed stages of recordings executed again, as a user types it."""
+
+import os
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from runner.cli.main import main
+from runner.contract import Message
+from runner.graph.graph import load_graph
+from runner.message.codec import decode
+from runner.process.children import ENVIRONMENT
+from runner.recording.recording import Recording
+from tests.runner.common.recordings import ToyRun, record, record_toys
+from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Total
+from tests.runner.replay.test_replay import replay
+
+DOUBLES = """
+name: doubles
+stages:
+  counter: {stage: tests.runner.common.toys:Counter}
+  doubler: {stage: tests.runner.common.toys:Doubler, inputs: {number: counter.number}}
+"""
+
+
+class Louder(Gatherer):
+    """The same totals, twice as large."""
+
+    def on_answers(self, answers: list[Answer], number: Number) -> Total:
+        total = super().on_answers(answers, number)
+        return Total(samples=2 * total.samples, last=total.last)
+
+
+class Mute(Gatherer):
+    """Fails on the third number."""
+
+    def on_answers(self, answers: list[Answer], number: Number) -> Total | None:
+        if number.value == 2:
+            raise ValueError("no third total")
+        return super().on_answers(answers, number)
+
+
+class Leaving(Gatherer):
+    """Its process goes while others work."""
+
+    def on_answers(self, answers: list[Answer], number: Number) -> Total:
+        threading.Timer(0.1, os._exit, (7,)).start()
+        return super().on_answers(answers, number)
+
+
+class Closing(Gatherer):
+    """Says that it was closed."""
+
+    def close(self) -> None:
+        Path(os.environ["CLOSED"]).touch()
+
+
+class Sum:
+    """Scores a toy run."""
+
+    def __init__(self, settings: dict[str, object]) -> None:
+        assert "gatherer" in settings
+
+    def score(self, run: Iterator[tuple[str, Message]]) -> dict[str, float]:
+        return {"sum": sum(float(message.samples.sum()) for _, message in run if isinstance(message, Total))}
+
+
+class Double(Message, frozen=True):
+    """Another class of the name that is recorded."""
+
+    text: str
+
+
+class Writer(Doubler):
+    """Says in words what a doubler says in numbers."""
+
+    def on_number(self, number: Number) -> Double:
+        return Double(text=f"twice {number.value}")
+
+
+class Count:
+    """Scores what doublers say."""
+
+    def __init__(self, settings: dict[str, object]) -> None: ...
+
+    def score(self, run: Iterator[tuple[str, Message]]) -> dict[str, float]:
+        return dict(Counter(type(message).__module__ for _, message in run))
+
+
+@pytest.fixture(scope="module")
+def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_toys(tmp_path_factory.mktemp("toys"))[0]
+
+
+def row(said: str, topic: str) -> list[str]:
+    """The cells of a topic in the first table: identical, changed, appeared, vanished."""
+    return next(line.split()[1:] for line in said.splitlines() if line.startswith(topic))
+
+
+@pytest.mark.parametrize("workers", ["1", "2", "3"])
+def test_without_a_change_nothing_changes_however_many_work(toys: Path, workers: str):
+    code, said = replay(toys, "--from", "splitter", "--workers", workers)
+    assert code == 0, said
+    assert "executed again: splitter, worker, gatherer; as recorded: counter, sink, watcher" in said
+    assert row(said, "worker/answer") == ["20", "-", "-", "-"]
+    assert said.splitlines()[-1] == "NOTHING CHANGES: 45 identical, of 3 stages"
+
+
+def test_fewer_parts_gather_to_other_totals(toys: Path):
+    code, said = replay(toys, "--set", "splitter.parts=3")
+    assert code == 0, said
+    assert row(said, "splitter/piece") == ["-", "15", "-", "5"]
+    assert row(said, "worker/answer") == ["-", "15", "-", "5"]
+    assert row(said, "gatherer/total") == ["-", "5", "-", "-"]
+    assert "vanished: splitter.piece#15, splitter.piece#16" in said
+    assert "device sink would have been sent: changed gatherer.total#0, gatherer.total#1" in said
+    assert "What it emitted stays as recorded" in said
+
+
+def test_more_parts_appear_with_the_ids_that_a_run_would_give(toys: Path, tmp_path: Path):
+    _, said = replay(toys, "--set", "splitter.parts=5")
+    assert row(said, "splitter/piece") == ["-", "20", "5", "-"]
+    live = Recording(record_toys(tmp_path, "splitter.parts=5")[0])
+    assert "appeared: splitter.piece#20, " in said
+    assert sum(id.startswith("splitter.piece#") for id in live.messages) == 25
+
+
+def test_a_swapped_class_changes_its_messages_by_how_much_and_the_score(toys: Path):
+    swap = "gatherer=tests.runner.replay.test_whatif:Louder"
+    code, said = replay(toys, "--swap", swap, "--set", "score=tests.runner.replay.test_whatif:Sum")
+    assert code == 0, said
+    assert "executed again: gatherer; as recorded: " in said
+    assert row(said, "gatherer/total") == ["-", "5", "-", "-"]
+    largest = max(largest_samples(toys))
+    (change,) = (line.split() for line in said.splitlines() if line.startswith("gatherer/total  samples[]"))
+    assert change == ["gatherer/total", "samples[]", "5", "of", "5", f"{largest:.3g}", "gatherer.total#0"]
+    before, now, gap = (float(cell) for cell in row(said, "sum "))
+    assert now == pytest.approx(2 * before, rel=1e-3)
+    assert gap == pytest.approx(before, rel=1e-3)
+
+
+def largest_samples(path: Path) -> Iterator[float]:
+    recording = Recording(path)
+    for id in recording.messages:
+        if id.startswith("gatherer.total#"):
+            yield float(decode(Total, recording.envelope(id).body).samples.max())
+
+
+def test_messages_of_another_class_have_changed(tmp_path: Path):
+    """Nobody consumes them: the graph is as good as before."""
+    file = tmp_path / "doubles.yaml"
+    file.write_text(DOUBLES)
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "doubles.mcap", ToyRun(graph, tmp_path).records())
+    swap = ("--swap", f"doubler={__name__}:Writer")
+    code, said = replay(path, *swap, "--set", f"score={__name__}:Count")
+    assert code == 0, said
+    assert row(said, "doubler/double") == ["-", "5", "-", "-"]
+    assert "doubler/double  fields    5 of 5        -  doubler.double#0" in said
+    assert (row(said, "tests.runner.common.toys"), row(said, __name__)) == (["10", "5", "-5"], ["-", "5", "-"])
+    code, said = replay(path, *swap, "--until", "doubler.double#1")
+    assert code == 0, said
+    assert "differ from the recording" in said
+
+
+def test_what_a_handler_raises_is_named_and_its_message_vanishes(toys: Path):
+    code, said = replay(toys, "--swap", "gatherer=tests.runner.replay.test_whatif:Mute")
+    assert code == 1
+    assert "FAILED gatherer.on_answers of counter.number#2: ValueError: no third total" in said
+    assert "vanished: gatherer.total#4" in said
+
+
+def test_a_process_that_has_gone_between_two_steps_is_named(toys: Path):
+    swap = ("--swap", "gatherer=tests.runner.replay.test_whatif:Leaving")
+    code, said = replay(toys, *swap, "--set", "worker.seconds=0.1", "--workers", "1")
+    assert code == 2
+    assert "gatherer.on_answers of counter.number#1: its process ended with exit code 7" in said
+
+
+def test_stages_are_closed_at_the_end(toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("CLOSED", str(tmp_path / "closed"))
+    code, said = replay(toys, "--swap", "gatherer=tests.runner.replay.test_whatif:Closing")
+    assert code == 0, said
+    assert (tmp_path / "closed").exists()
+
+
+def test_another_seed_executes_everything(toys: Path):
+    _, said = replay(toys, "--set", "seed=8")
+    assert "executed again: splitter, worker, gatherer, watcher; as recorded: counter, sink" in said
+    assert row(said, "splitter/piece") == ["20", "-", "-", "-"]
+    assert row(said, "worker/answer") == ["-", "20", "-", "-"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["--from", "gatherr"], "--from gatherr: no stage 'gatherr'; did you mean 'gatherer'? valid: gatherer"),
+        (["--from", "counter"], "counter is a device, and what it emitted is recorded; valid: splitter, worker"),
+        (["--set", "counter.count=3"], "counter is a device"),
+        (["--set", "splitter.parts=4"], "nothing changes; valid: --from STAGE"),
+        (["--set", "splitter.part=4"], "unknown key 'part'; did you mean 'parts'"),
+        (["--swap", "gatherer"], "--swap gatherer: expected stage=module:Class"),
+        (["--swap", "gather=a:B"], "no stage 'gather'; did you mean 'gatherer'"),
+        (
+            ["--swap", "gatherer=tests.runner.common.toys:Gathrer"],
+            "no class 'Gathrer' in tests.runner.common.toys",
+        ),
+        (["--swap", "gatherer=tests.runner.common.toys:Doubler"], "has no input 'answers'"),
+        (["--from", "splitter", "--verify"], "--verify compares the recording as it is"),
+    ],
+)
+def test_what_is_impossible_is_refused_with_what_is_valid(
+    toys: Path, arguments: list[str], error: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)  # nothing is executed: this process will do
+    assert main(["replay", str(toys), *arguments]) == 2
+    assert error in capsys.readouterr().err

@@ -1,0 +1,213 @@
+"""With keys, only the hosts of a graph take part: whoever else tries everything publishes, hears and calls nothing."""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from runner.graph.placement import Credentials, Host, Network
+from runner.hosts.keys import add_keys, credentials, make_keys
+from runner.message.packet import Process
+from runner.transport.bus import Bus
+from runner.transport.session import Gateway, Router, new_endpoint
+from tests.runner.common.waiting import wait_until
+
+NAMES = ("head", "worker1", "worker2")
+PIECE = "again/worker/0/piece"
+NUMBER = "m/counter/number"
+STRANGER = "present/stranger/0/0"
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of the hosts of a graph, and of one that is not in the graph."""
+    folder = tmp_path_factory.mktemp("own") / "keys"
+    make_keys(folder, [Host(name, "127.0.0.1") for name in NAMES])
+    add_keys(folder, [Host("elsewhere", "127.0.0.1")])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def foreign_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of the same names from another authority."""
+    folder = tmp_path_factory.mktemp("foreign") / "keys"
+    make_keys(folder, [Host(name, "127.0.0.1") for name in NAMES])
+    return folder
+
+
+@dataclass
+class Table:
+    """The head and a worker of a run, with all that reaches the worker and all that the head is asked."""
+
+    endpoint: str
+    head: Bus
+    worker: Bus
+    arrived: list[tuple[str, bytes]] = field(default_factory=list)
+    present: list[str] = field(default_factory=list)
+    asked: list[bytes] = field(default_factory=list)
+
+
+@pytest.fixture(params=["direct", "routed"])
+def table(keys: Path, request: pytest.FixtureRequest) -> Iterator[Table]:
+    endpoint = new_endpoint("tls/127.0.0.1:0")
+    routed = request.param == "routed"
+    own, other = (
+        Network(name, "head", NAMES, "tls/127.0.0.1:0", routed, credentials(keys, name)) for name in NAMES[:2]
+    )
+    router = [Router(endpoint, own)] if routed else []
+    head = Bus("run", endpoint, network=own, process=Process("counter", 0), listen=not routed)
+    made = Table(endpoint, head, Bus("run", endpoint, network=other))
+    made.worker.subscribe("**", lambda packet: made.arrived.append((packet.key, packet.payload)))
+    made.worker.watch(lambda process, _: made.present.append(f"present/{process.path}"))
+    head.serve("status", lambda question: made.asked.append(question) or b"up")
+    assert made.worker.ask("status", b"worker1", 10) == b"up"
+    yield made
+    for session in (made.worker, made.head, *router):
+        session.close()
+
+
+@dataclass
+class Peer:
+    """Somebody with Zenoh and whatever credentials, who keeps to no rules of the runner."""
+
+    session: zenoh.Session
+    heard: list[bytes] = field(default_factory=list)
+    seen: list[str] = field(default_factory=list)
+    answers: list[bytes] = field(default_factory=list)
+
+
+def call_in(endpoint: str, shown: Credentials | None, trusted: str, mode: str = "peer") -> zenoh.Session:
+    tls = {"root_ca_certificate": trusted}
+    if shown is not None:
+        tls |= {f"{side}_private_key": shown.key for side in ("listen", "connect")}
+        tls |= {f"{side}_certificate": shown.certificate for side in ("listen", "connect")}
+        tls |= {"enable_mtls": True}
+    listen = "tcp/127.0.0.1:0" if shown is None else "tls/127.0.0.1:0"
+    config = zenoh.Config()
+    listened = [] if mode == "client" else [listen]
+    settings = {"mode": mode, "connect/endpoints": [endpoint], "listen/endpoints": listened}
+    for key, value in {**settings, "scouting/multicast/enabled": False, "transport/link/tls": tls}.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def try_everything(table: Table, session: zenoh.Session, seconds: float) -> Peer:
+    """Subscribes, declares itself present, publishes and asks, while the run goes on; tries again for a while."""
+    peer = Peer(session)
+    keep = [
+        session.declare_subscriber("run/m/**", lambda sample: peer.heard.append(sample.payload.to_bytes())),
+        session.liveliness().declare_subscriber(
+            "run/present/**", lambda sample: peer.seen.append(str(sample.key_expr)), history=True
+        ),
+        session.liveliness().declare_token(f"run/{STRANGER}"),
+    ]
+    table.head.announce()
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not succeeded(table, peer):
+        table.head.publish(NUMBER, b"number")
+        session.put(f"run/{PIECE}", b"piece")
+        replies = session.get("run/q/status", payload=b"stranger", timeout=0.5)
+        peer.answers += [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        time.sleep(0.1)
+    for declared in keep:
+        declared.undeclare()
+    return peer
+
+
+def succeeded(table: Table, peer: Peer) -> bool:
+    """Whether all of it had an effect."""
+    published = (PIECE, b"piece") in table.arrived and STRANGER in table.present
+    seen = any(key.startswith("run/present/counter/") for key in peer.seen)
+    return published and seen and b"number" in peer.heard and b"up" in peer.answers
+
+
+def test_a_host_of_the_graph_does_all_of_it(table: Table, keys: Path):
+    own = credentials(keys, "worker2")
+    with call_in(table.endpoint, own, own.ca) as session:
+        assert succeeded(table, try_everything(table, session, seconds=30))
+
+
+@pytest.mark.parametrize("kind", ["no certificate", "another authority", "a host that is not in the graph"])
+def test_anybody_else_does_nothing_of_it(table: Table, keys: Path, foreign_keys: Path, kind: str):
+    shown = {
+        "no certificate": None,
+        "another authority": credentials(foreign_keys, "worker1"),
+        "a host that is not in the graph": credentials(keys, "elsewhere"),
+    }[kind]
+    with call_in(table.endpoint, shown, str(keys / "ca.pem")) as session:
+        peer = try_everything(table, session, seconds=2)
+        own = {f"run/{STRANGER}"}
+        assert (peer.heard, set(peer.seen) - own, peer.answers) == ([], set(), [])
+        wait_until(lambda: (NUMBER, b"number") in table.arrived)
+        assert (PIECE, b"piece") not in table.arrived
+        assert STRANGER not in table.present
+        assert b"stranger" not in table.asked
+
+
+def test_whoever_speaks_no_tls_is_not_let_in(table: Table, keys: Path):
+    with call_in(table.endpoint.replace("tls/", "tcp/"), None, str(keys / "ca.pem")) as session:
+        assert try_everything(table, session, seconds=1).heard == []
+        assert (PIECE, b"piece") not in table.arrived
+
+
+def test_only_the_head_gives_orders(keys: Path):
+    endpoint = new_endpoint("tls/127.0.0.1:0")
+    networks = [Network(name, "head", NAMES, "tls/127.0.0.1:0", False, credentials(keys, name)) for name in NAMES]
+    head = Bus("hosts/toys", endpoint, network=networks[0], listen=True)
+    worker, other = (Bus("hosts/toys", endpoint, network=network) for network in networks[1:])
+    orders: list[bytes] = []
+    reports: list[bytes] = []
+    worker.subscribe("order/worker1/1", lambda packet: orders.append(packet.payload))
+    worker.subscribe("report/*/*", lambda packet: reports.append(packet.payload))
+
+    def all_arrived() -> bool:
+        other.publish("order/worker1/1", b"from worker2")
+        other.publish("report/worker2/1", b"from worker2")
+        head.publish("order/worker1/1", b"from the head")
+        return b"from the head" in orders and b"from worker2" in reports
+
+    wait_until(all_arrived)
+    assert set(orders) == {b"from the head"}
+    for bus in (other, worker, head):
+        bus.close()
+
+
+def test_who_has_the_reader_s_certificate_hears_and_says_nothing(keys: Path):
+    meeting, public = (new_endpoint("tls/127.0.0.1:0") for _ in range(2))
+    network, other = (
+        Network(name, "head", NAMES, "tls/127.0.0.1:0", False, credentials(keys, name)) for name in NAMES[:2]
+    )
+    head = Bus("run", meeting, network=network, process=Process("counter", 0), listen=True)
+    gateway = Gateway(new_endpoint(), meeting, network, public)
+    worker = Bus("run", meeting, network=other)
+    arrived: list[str] = []
+    worker.subscribe("**", lambda packet: arrived.append(packet.key))
+    heard: dict[str, list[bytes]] = {}
+    sessions: list[zenoh.Session] = []
+    for name in ("reader", "elsewhere"):
+        own = credentials(keys, name)
+        session = call_in(public, own, own.ca, mode="client")
+        sessions.append(session)
+        heard[name] = []
+        session.declare_subscriber(
+            "run/m/**", lambda sample, found=heard[name]: found.append(sample.payload.to_bytes())
+        )
+
+    def told() -> bool:
+        head.publish(NUMBER, b"number")
+        for session in sessions:
+            session.put(f"run/{PIECE}", b"piece")
+        return bool(heard["reader"]) and NUMBER in arrived
+
+    wait_until(told)
+    assert heard["elsewhere"] == []
+    assert set(arrived) == {NUMBER}
+    for session in sessions:
+        session.close()
+    worker.close()
+    gateway.close()
+    head.close()

@@ -1,0 +1,153 @@
+"""Who may listen to a run, and speak: everybody hears everything where the graph says so, and forges nothing."""
+
+import contextlib
+import os
+import pwd
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from runner.hosts.head import control
+from runner.message.codec import pack
+from runner.recording.recording import Recording
+from runner.testing import read_until
+from runner.transport.session import private
+from tests.runner.common.machines import Party, on_loopback
+from tests.runner.common.runs import ALBUM, TOYS, changed, finish, meeting_of, start
+from tests.runner.common.waiting import wait_until
+from tests.runner.transport.test_bad_input import public_address, run_of, stranger
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "listen.py"
+
+
+def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path: Path):
+    address = public_address()
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"listen={address}", f"counter.go={tmp_path / 'go'}", "counter.count=50")
+    heard: list[tuple[str, bytes]] = []
+    before = read_until(process, "run toys-")
+    with stranger(address) as session:
+        session.declare_subscriber(
+            f"{run_of(before)}/**", lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+        )
+        before += read_until(process, "processes are ready")
+        (tmp_path / "go").touch()
+        ended = finish(process, tmp_path, before)
+    assert ended.code == 0, ended.output
+    recording = Recording(ended.recording)
+    assert recording.verdict.complete
+    messages = [(key.partition("/m/")[2], payload) for key, payload in heard if "/m/" in key]
+    recorded = [(recording.messages[envelope.id].topic, pack(envelope)) for envelope in recording.envelopes()]
+    assert len(recorded) == 50 * 10 + 1
+    assert Counter(messages) == Counter(recorded)
+    steps = Counter(payload for key, payload in heard if "/s/" in key)
+    assert {pack(step): 1 for step in recording.steps}.items() <= steps.items()
+
+
+@contextlib.contextmanager
+def listening(address: str, run: str) -> Iterator[subprocess.Popen[str]]:
+    """The example, in a process of its own."""
+    command = [sys.executable, str(EXAMPLE), address, run]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "listening\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_hears(tmp_path: Path):
+    address = public_address()
+    process = start(ALBUM, tmp_path, f"listen={address}", f"camera.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    with listening(address, run_of(before)) as stopped, stranger(address) as session:
+        heard: list[str] = []
+        session.declare_subscriber(f"{run_of(before)}/m/camera/*", lambda sample: heard.append(str(sample.key_expr)))
+        os.kill(stopped.pid, signal.SIGSTOP)
+        time.sleep(1)
+        (tmp_path / "go").touch()
+        ended = finish(process, tmp_path, before)
+        wait_until(lambda: len(heard) == 60)
+    assert (ended.code, len(ended.result)) == (0, 60), ended.output
+    assert Recording(ended.recording).verdict.complete
+
+
+def test_the_example_shows_what_flows(tmp_path: Path):
+    address = public_address()
+    process = start(TOYS, tmp_path, f"listen={address}", "counter.count=100000", "counter.period=0.02")
+    before = read_until(process, "processes are ready")
+    with listening(address, run_of(before)) as listener:
+        assert listener.stdout is not None
+        shown = [listener.stdout.readline() for _ in range(50)]
+    process.terminate()
+    finish(process, tmp_path, before)
+    assert any(
+        re.fullmatch(r"splitter\.piece#\d+ Piece {'index': \d, 'count': 4, 'value': \d+}\n", one) for one in shown
+    )
+
+
+INTRUDER = """
+import json, os, sys, zenoh
+os.setuid(int(sys.argv[1]))
+endpoint, run = sys.argv[2:]
+config = zenoh.Config.from_json5(json.dumps(
+    {"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": 2000, "exit_on_failure": True}}
+))
+try:
+    with zenoh.open(config) as session:
+        session.put(f"{run}/m/sink/finished", b"nonsense")
+        print("in")
+except zenoh.ZError:
+    print("out")
+"""
+
+
+def comes_in(endpoint: str, run: str, user: int) -> bool:
+    """Whether a process of some user can call at an endpoint."""
+    command = [sys.executable, "-c", INTRUDER, str(user), endpoint, run]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return {"in": True, "out": False}[done.stdout.strip()]
+
+
+@pytest.fixture
+def other_user() -> int:
+    if os.getuid() != 0:
+        pytest.skip("needs the right to become another user")
+    return pwd.getpwnam("nobody").pw_uid
+
+
+def test_another_user_of_the_machine_comes_in_nowhere(tmp_path: Path, other_user: int):
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}")
+    before = read_until(process, "processes are ready")
+    gateway = before.partition(" on ")[2].split()[0]
+    endpoints = (gateway, meeting_of(gateway))
+    assert [comes_in(endpoint, run_of(before), os.getuid()) for endpoint in endpoints] == [True, True]
+    assert [comes_in(endpoint, run_of(before), other_user) for endpoint in endpoints] == [False, False]
+    (tmp_path / "go").touch()
+    ended = finish(process, tmp_path, before)
+    assert ended.code == 0, ended.output
+
+
+@pytest.mark.slow
+def test_another_user_of_the_machine_has_no_agent_start_anything(tmp_path: Path, other_user: int):
+    """Hosts without keys, all on loopback, meet where the head's address is written: at a socket of their user."""
+    machines = on_loopback()
+    party = Party(machines, tmp_path).start_all("counter.count=100", "counter.period=0.1")
+    try:
+        before = read_until(party.hosts["head"], "processes are ready")
+        address = f"tcp/{machines.addresses['head']}"
+        assert comes_in(private(address), control("hosts"), os.getuid())
+        assert not comes_in(private(address), control("hosts"), other_user)
+        assert not comes_in(address, control("hosts"), os.getuid())
+        assert party.end("head", before).code == 0
+    finally:
+        party.close()
