@@ -4,11 +4,14 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from typing import TextIO
 
 from runner.contract import Level
 
 WIDTH = 16
+FEW = 5
+"""Of many things, those that are named."""
 _COLOURS: dict[Level, str] = {"debug": "\033[2m", "info": "", "warning": "\033[33m", "error": "\033[31m"}
 _RESET = "\033[0m"
 
@@ -58,3 +61,9 @@ class Terminal:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)
+
+
+def listed(items: Sequence[str], joint: str = ", ") -> str:
+    """The first few, and how many more there are."""
+    more = f" and {len(items) - FEW} more" if len(items) > FEW else ""
+    return f"{joint.join(items[:FEW])}{more}"

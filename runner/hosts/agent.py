@@ -9,7 +9,6 @@ import contextlib
 import queue
 import secrets
 import signal
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from runner.hosts.head import (
     network_of,
 )
 from runner.message.packet import Packet, Process
-from runner.process.children import Family, Handle, behind, last_lines
+from runner.process.children import Family, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
@@ -180,10 +179,7 @@ class Agent:
         for child in self._children.values():
             child.handle.signal_group(signal.SIGTERM)
         for child in self._children.values():
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.handle.wait(GRACE_SECONDS)
-            child.handle.signal_group(signal.SIGKILL)
-            child.handle.wait()
+            end_process(child.handle, GRACE_SECONDS)
         self._forks.close()
         if left := self._family.close():
             self._say(f"the stages {behind(left)}")

@@ -31,8 +31,9 @@ from runner.graph.document import Document, read_document, suggest
 from runner.graph.graph import NUMERICAL
 from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
+from runner.inspect.compare import SHOWN, clipped
 from runner.message.packet import Packet, Process
-from runner.process.children import Polled
+from runner.process.children import Handle
 from runner.process.stage_process import Assignment
 from runner.recording.provenance import (
     fingerprint,
@@ -42,6 +43,7 @@ from runner.recording.provenance import (
     runner_version,
     with_texts,
 )
+from runner.terminal import listed
 from runner.transport.bus import Bus
 from runner.transport.session import Router, private
 
@@ -54,7 +56,6 @@ ANSWER_SECONDS = 10.0
 """What a host may take to say that a process has gone that it was told to kill."""
 CUT_OFF = 1
 """Stands for the exit code of a process that nobody hears of any more."""
-SHOWN_DIFFERENCES = 5
 PIECE_BYTES = 4 * 2**20
 """Of a recording that a host reads, at a time."""
 _MISSING = "nothing"
@@ -123,7 +124,7 @@ def control(graph: str) -> str:
     return f"hosts/{graph}"
 
 
-class RemoteChild(Polled):
+class RemoteChild(Handle):
     """A process on another host, as the supervisor sees it: like the :class:`subprocess.Popen` of one that is here."""
 
     def __init__(self, process: Process, log: Path, send: Callable[[Order], None], give_up: Callable[[], None]):
@@ -140,7 +141,7 @@ class RemoteChild(Polled):
         log.touch()
 
     def poll(self) -> int | None:
-        """See :class:`Polled`."""
+        """See :class:`Handle`."""
         if self.returncode is None and time.monotonic() > self._gone_by:
             self._give_up()
         return self.returncode
@@ -353,12 +354,8 @@ def _refuse_other_graph(own: Hello, hello: Hello) -> None:
     """All hosts must mean the same graph; settings are the head's alone and reach them with their tasks."""
     found = list(differences(msgspec.json.decode(own.graph), msgspec.json.decode(hello.graph)))
     if found:
-        shown = [f"{key}: {there} at {hello.host}, {here} at the head" for key, here, there in found]
-        more = f" and {len(found) - SHOWN_DIFFERENCES} more" if len(found) > SHOWN_DIFFERENCES else ""
-        raise Refused(
-            f"host {hello.host} has another graph: {'; '.join(shown[:SHOWN_DIFFERENCES])}{more}; "
-            f"copy the head's file to it"
-        )
+        shown = listed([f"{key}: {there} at {hello.host}, {here} at the head" for key, here, there in found], "; ")
+        raise Refused(f"host {hello.host} has another graph: {shown}; copy the head's file to it")
 
 
 def differences(own: Any, theirs: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
@@ -389,8 +386,7 @@ def _read(file: Path, offset: int) -> bytes:
 
 
 def _short(value: Any) -> str:
-    text = value if value is _MISSING else repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return clipped(value if value is _MISSING else repr(value), SHOWN)
 
 
 def network_of(layout: Layout, host: str) -> Network:

@@ -1,12 +1,19 @@
-"""The id of a message: ``stage.port#sequence``, plain text on the wire and in recordings."""
+"""The id of a message, ``stage.port#sequence``: plain text on the wire and in recordings; and which came lately."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections import OrderedDict
+from typing import Annotated, TypeVar
 
 import msgspec
 
 IdText = Annotated[str, msgspec.Meta(pattern=r"^\w+\.\w+#[0-9]{1,15}$(?!\n)")]
+
+
+K = TypeVar("K")
+V = TypeVar("V")
+REMEMBERED = 10_000
+"""What a process remembers to recognise what comes twice."""
 
 
 class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
@@ -30,3 +37,16 @@ class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
 
     def __str__(self) -> str:
         return f"{self.stage}.{self.port}#{self.sequence}"
+
+
+class Recent(OrderedDict[K, V]):
+    """The newest that was entered, so many at the most."""
+
+    def __init__(self, most: int = REMEMBERED) -> None:
+        super().__init__()
+        self._most = most
+
+    def __setitem__(self, key: K, value: V) -> None:
+        super().__setitem__(key, value)
+        if len(self) > self._most:
+            self.popitem(last=False)

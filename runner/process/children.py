@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import time
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,7 +62,13 @@ class Handle(Protocol):
 
     def wait(self, timeout: float | None = None) -> int:
         """Waits for its end; raises subprocess.TimeoutExpired."""
-        ...
+        began, pause = time.monotonic(), 0.0005
+        while (code := self.poll()) is None:
+            if timeout is not None and time.monotonic() - began >= timeout:
+                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout)
+            time.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
+        return code
 
     def send_signal(self, signum: int, /) -> None:
         """Signals this process alone; one that has gone is no error."""
@@ -74,22 +79,12 @@ class Handle(Protocol):
         ...
 
 
-class Polled(ABC):
-    """A process whose end is seen only by who looks."""
-
-    @abstractmethod
-    def poll(self) -> int | None:
-        """Its exit code, negative where a signal killed it; None while it lives."""
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end; raises subprocess.TimeoutExpired."""
-        began, pause = time.monotonic(), 0.0005
-        while (code := self.poll()) is None:
-            if timeout is not None and time.monotonic() - began >= timeout:
-                raise subprocess.TimeoutExpired(str(self), timeout)
-            time.sleep(pause)
-            pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
-        return code
+def end_process(handle: Handle, seconds: float) -> None:
+    """Waits for the end of a process, and kills it where that does not come, and whatever it has left behind."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        handle.wait(seconds)
+    handle.signal_group(signal.SIGKILL)
+    handle.wait()
 
 
 class Spawned(subprocess.Popen[bytes]):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from runner.contract import Refused
-from runner.process.children import DESCENT, ENVIRONMENT, PARENT, Polled, signal_group
+from runner.process.children import DESCENT, ENVIRONMENT, PARENT, Handle, signal_group
 
 EXIT_FAILED = 1
 ROOM = 256
@@ -60,7 +60,7 @@ class Threads(Refused):
     """A process cannot be forked: what its other threads hold would be held for ever."""
 
 
-class Forked(Polled):
+class Forked(Handle):
     """A child of this process that was forked, with the interface of :class:`subprocess.Popen`."""
 
     def __init__(self, pid: int) -> None:
@@ -69,7 +69,7 @@ class Forked(Polled):
         self._polling = threading.Lock()
 
     def poll(self) -> int | None:
-        """See :class:`Polled`."""
+        """See :class:`Handle`."""
         with self._polling:
             if self.returncode is None:
                 pid, status = os.waitpid(self.pid, os.WNOHANG)

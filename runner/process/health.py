@@ -12,6 +12,7 @@ from typing import Any
 import psutil
 
 from runner.graph.graph import Limits
+from runner.inspect.info import byte_count
 from runner.message import codec
 from runner.message.codec import Pulse
 from runner.message.packet import Process
@@ -113,17 +114,12 @@ class Watch:
         if newest.state == "working" and newest.handler != SOURCE and newest.busy_ns > limits.timeout * 1e9:
             return f"hung: {newest.handler} has computed for more than {limits.timeout:g} s (timeout)"
         if newest.memory_bytes > limits.memory_bytes:
-            return f"out of memory: it holds {gigabytes(newest.memory_bytes)}, its limit is {limits.memory} (memory)"
+            return f"out of memory: it holds {byte_count(newest.memory_bytes)}, its limit is {limits.memory} (memory)"
         return ""
 
 
 def _within(pulse: Pulse | None) -> str:
     return f", last in {pulse.handler}" if pulse is not None and pulse.handler else ""
-
-
-def gigabytes(count: float) -> str:
-    """Bytes of memory for people to read."""
-    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def oom_kills() -> int:

@@ -13,13 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from runner.graph.graph import Route
 from runner.message.codec import Envelope, Step, answered
+from runner.message.ids import Recent
 from runner.message.packet import Process
 
 LATEST_SECONDS = 0.5
 """After that the newest message of an edge of policy ``latest`` is offered again, then after twice the time, ..."""
-
-REMEMBERED = 10_000
-"""Ids of messages that are recognised when they come once more."""
 
 Send = Callable[[str, bytes, bool], None]
 """Sends a payload under a key; the last argument says whether it may be dropped where nobody takes it."""
@@ -63,7 +61,7 @@ class Redelivery:
         ]
         self._open: dict[str, dict[str, tuple[str, ...]]] = {}
         """Causes of the messages, by stage and id, whose step has not come yet."""
-        self._recent: OrderedDict[str, None] = OrderedDict()
+        self._recent = Recent[str, None]()
         """Ids of messages that have come lately."""
         self._early: set[tuple[str, int, str, str]] = set()
         """(stage, taker, port, id) done with before it came: its publisher's link is the slower one."""
@@ -77,8 +75,6 @@ class Redelivery:
         self._open.setdefault(topic.partition("/")[0], {})[id] = message.causes
         known = id in self._recent
         self._recent[id] = None
-        if len(self._recent) > REMEMBERED:
-            self._recent.popitem(last=False)
         for place, waiting in self._edges.get(topic, {}).items():
             early = (*place, id) in self._early
             self._early.discard((*place, id))

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import traceback
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.message import codec
 from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, LogLine, Lost, Outcome, Step, answered
-from runner.message.ids import MessageId
+from runner.message.ids import MessageId, Recent
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, explain_death, volunteer_for_oom
@@ -38,8 +37,6 @@ from runner.transport.presence import Presence
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
-REMEMBERED = 10_000
-"""Ids a process remembers to recognise what it is sent twice."""
 CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
 """How long it may take at the end until the recorder says that it has a step."""
@@ -112,9 +109,9 @@ class StageProcess:
             log=self._log,
             numbers=task.numbers,
         )
-        self._arrived: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._arrived = Recent[tuple[str, str], None]()
         """(port, id) of what has arrived, so that it is worked on once."""
-        self._remember(one for one in task.consumed if not self._node.keeps(one[0]))
+        self._arrived.update(dict.fromkeys(one for one in task.consumed if not self._node.keeps(one[0])))
         self._left: list[tuple[str, str]] = []
         """(port, id) of what was refused since the last step."""
         self._refusals = Refusals(lambda text: self._log(text, "error"))
@@ -286,7 +283,7 @@ class StageProcess:
             if id:
                 self._left.append((name, id))
         if id:
-            self._remember([(name, id)])
+            self._arrived[name, id] = None
 
     # ------------------------------------------------------------------------------------------ steps
 
@@ -396,12 +393,6 @@ class StageProcess:
 
     def _skipped(self) -> dict[str, int]:
         return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
-
-    def _remember(self, arrived: Iterable[tuple[str, str]]) -> None:
-        for key in arrived:
-            self._arrived[key] = None
-        while len(self._arrived) > REMEMBERED:
-            self._arrived.popitem(last=False)
 
     def _warn(self, text: str) -> None:
         self._log(text, "warning")

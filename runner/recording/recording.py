@@ -21,6 +21,7 @@ from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
 from runner.recording.provenance import fingerprint, numerical
+from runner.terminal import listed
 
 T = TypeVar("T")
 PROFILE = "scene-programming"
@@ -85,9 +86,8 @@ class Verdict:
         return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason, **counts}
 
     def __str__(self) -> str:
-        more = f" and {len(self.missing) - 5} more" if len(self.missing) > 5 else ""
         reasons = [self.reason] if self.reason else []
-        reasons += [f"{len(self.missing)} missing: {', '.join(self.missing[:5])}{more}"] if self.missing else []
+        reasons += [f"{len(self.missing)} missing: {listed(self.missing)}"] if self.missing else []
         return f"{self.word}: {'; '.join(reasons)}" if reasons else self.word
 
 

@@ -23,9 +23,8 @@ from runner.replay.partial import PartialReplay
 from runner.replay.replay import change
 from runner.replay.tasks import HEADER, kind_of, opened, what_differs
 from runner.replay.tolerances import compare_origin
+from runner.terminal import listed
 
-SHOWN = 5
-"""Ids that are named before ``and N more``."""
 Effect = Literal["identical", "changed", "appeared", "vanished"]
 """What becomes of a message."""
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
@@ -131,10 +130,10 @@ def _verdict(recording: Recording, graph: Graph, names: Sequence[str], replay: P
     if effects["changed"]:
         yield ""
         yield from summary.lines()
-    yield from (f"{effect}: {_listed(effects[effect])}" for effect in ("appeared", "vanished") if effects[effect])
+    yield from (f"{effect}: {listed(effects[effect])}" for effect in ("appeared", "vanished") if effects[effect])
     yield from _devices(graph, names, effects)
     if lost := replay.frozen.blocked():
-        yield f"devices answered what is not asked any more, left out: {_listed(lost)}"
+        yield f"devices answered what is not asked any more, left out: {listed(lost)}"
     yield from (f"FAILED {error}" for error in replay.errors)
     yield ""
     yield from _scores(recording, graph, names, replay)
@@ -155,14 +154,9 @@ def _devices(graph: Graph, names: Collection[str], effects: Mapping[Effect, Sequ
     for device in (node for node in graph.nodes.values() if node.type.cls.device):
         sources = {f"{edge.stage}/{edge.port}" for edge in device.inputs.values() if edge.stage in names}
         sent = {effect: [id for id in effects[effect] if MessageId.of(id).topic in sources] for effect in DIFFERENT}
-        said = "; ".join(f"{effect} {_listed(ids)}" for effect, ids in sent.items() if ids)
+        said = "; ".join(f"{effect} {listed(ids)}" for effect, ids in sent.items() if ids)
         if said:
             yield f"device {device.name} would have been sent: {said}. What it emitted stays as recorded"
-
-
-def _listed(ids: Sequence[str]) -> str:
-    more = f" and {len(ids) - SHOWN} more" if len(ids) > SHOWN else ""
-    return f"{', '.join(ids[:SHOWN])}{more}"
 
 
 # ------------------------------------------------------------------------------------ the score

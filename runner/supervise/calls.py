@@ -7,7 +7,6 @@ import inspect
 import itertools
 import textwrap
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -20,7 +19,7 @@ from runner.graph.document import suggest
 from runner.graph.graph import Graph, Node, command_port
 from runner.graph.ports import port_name
 from runner.message.codec import LogLine, Step
-from runner.message.ids import MessageId
+from runner.message.ids import MessageId, Recent
 
 T = TypeVar("T")
 KEPT = 100
@@ -103,8 +102,8 @@ class Calls:
     def __init__(self, graph: Graph, publish: Publish) -> None:
         self._graph = graph
         self._publish = publish
-        self._calls: OrderedDict[str, _Call] = OrderedDict()
-        self._answers: OrderedDict[str, bytes] = OrderedDict()
+        self._calls = Recent[str, _Call](KEPT)
+        self._answers = Recent[str, bytes](KEPT)
         self._changed = threading.Condition()
         self._closed = False
 
@@ -175,11 +174,9 @@ class Calls:
             self._closed = True
             self._changed.notify_all()
 
-    def _remember(self, kept: OrderedDict[str, T], id: str, value: T) -> None:
+    def _remember(self, kept: Recent[str, T], id: str, value: T) -> None:
         with self._changed:
             kept[id] = value
-            if len(kept) > KEPT:
-                kept.popitem(last=False)
 
     def _advance(self, own: bool, call: _Call, step: Step) -> None:
         if own:

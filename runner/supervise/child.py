@@ -1,23 +1,19 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
-import contextlib
 import signal
-import subprocess
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from runner.graph.graph import Limits, Route
 from runner.hosts.head import RemoteChild
+from runner.inspect.info import byte_count
 from runner.message.codec import Pulse, Step, answered
-from runner.message.ids import MessageId
+from runner.message.ids import MessageId, Recent
 from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
-from runner.process.health import Watch, gigabytes, oom_kills
+from runner.process.health import Watch, oom_kills
 
-REMEMBERED = 10_000
-"""Messages of which it is known that a stage has done with them."""
 RESENT = 1000
 """Those that a successor is told."""
 
@@ -62,15 +58,8 @@ class Child:
         elsewhere = isinstance(self.handle, RemoteChild)  # whose kernel's count nobody here knows
         if code != -signal.SIGKILL or elsewhere or oom_kills() == self.oom_kills:
             return ending(code)
-        held = f"; it last held {gigabytes(newest.memory_bytes)}" if newest is not None else ""
+        held = f"; it last held {byte_count(newest.memory_bytes)}" if newest is not None else ""
         return f"{ending(code)}: the kernel was out of memory{held}"
-
-    def wait(self, seconds: float) -> None:
-        """Waits for its end, and kills it where that does not come, and whatever it has left behind."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.handle.wait(seconds)
-        self.handle.signal_group(signal.SIGKILL)
-        self.handle.wait()
 
 
 class Progress:
@@ -84,7 +73,7 @@ class Progress:
         self.undone: dict[tuple[str, str, str], None] = {}
         """(consumer, port, id) of parts that were sent and not done with."""
         self._shared = [route for route in routes if route.shared]
-        self._consumed: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._consumed = Recent[tuple[str, str], None]()
 
     @property
     def newest_consumed(self) -> tuple[tuple[str, str], ...]:
@@ -99,8 +88,6 @@ class Progress:
         """Takes a step that the recorder has; only what was done counts."""
         for key in answered(step):
             self._consumed[key] = None
-            if len(self._consumed) > REMEMBERED:
-                self._consumed.popitem(last=False)
         if step.outcome != "done":
             return
         self.started |= not step.consumed

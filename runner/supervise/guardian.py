@@ -11,7 +11,7 @@ from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
 from runner.message.codec import Step, answered
 from runner.message.packet import RECORDER, Process
-from runner.process.children import DUMP, behind, last_lines
+from runner.process.children import DUMP, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
@@ -148,12 +148,12 @@ class Guardian:
             time.sleep(LOOK_SECONDS)
         for child in filter(self._publishes, children):
             child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
-            child.wait(0)
+            end_process(child.handle, 0)
         for child in children:
             self._report_lost(child)
         deadline = time.monotonic() + END_GRACE_SECONDS
         for child in children:
-            child.wait(deadline - time.monotonic())
+            end_process(child.handle, deadline - time.monotonic())
             self._report_lost(child)
 
     def _publishes(self, child: Child) -> bool:
@@ -164,7 +164,7 @@ class Guardian:
         for child, grace_seconds in ((self._recorder, RECORDER_GRACE_SECONDS), (self._viewer, STAGE_GRACE_SECONDS)):
             if child is not None:
                 child.handle.signal_group(signal.SIGTERM)
-                child.wait(grace_seconds)
+                end_process(child.handle, grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
         return "" if self._recorder is None else self._recorder.reason()
