@@ -9,7 +9,7 @@ import textwrap
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import yaml
@@ -21,7 +21,6 @@ from runner.graph.ports import port_name
 from runner.message.codec import LogLine, Step
 from runner.message.ids import MessageId, Recent
 
-T = TypeVar("T")
 KEPT = 100
 """Calls that may still be asked about."""
 PATIENCE_SECONDS = 5.0
@@ -92,6 +91,8 @@ class _Call:
     lines: list[tuple[Level, str]] = field(default_factory=list[tuple[Level, str]])
     step: Step | None = None
     """The step that did it; of replicas, the first."""
+    answer: str = ""
+    """Id of the message that ends it, once the step is known that emitted it."""
     payload: bytes = b""
     done: bool = False
 
@@ -127,7 +128,7 @@ class Calls:
         replicas = set(range(self._graph.nodes[request.stage].replicas))
         call = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
         port = command_port(request.stage, request.command)
-        return self._publish(port, command, lambda id: self._remember(self._calls, id, call))
+        return self._publish(port, command, lambda id: self._remember(id, call))
 
     def progress(self, question: CallQuestion) -> Progress:
         """Waits for news of a call, but not for long."""
@@ -153,8 +154,13 @@ class Calls:
             self._changed.notify_all()
 
     def note_answer(self, id: str, payload: bytes) -> None:
-        """Takes a message that may answer a call, before the step that emitted it."""
-        self._remember(self._answers, id, payload)
+        """Takes a message that may answer a call, before or after the step that emitted it."""
+        with self._changed:
+            self._answers[id] = payload
+            for call in self._calls.values():
+                if call.answer == id:
+                    self._conclude(call)
+            self._changed.notify_all()
 
     def note_step(self, step: Step) -> None:
         """Takes a step: the one of a command, or a later one that answers it; one that failed is taken again."""
@@ -174,9 +180,9 @@ class Calls:
             self._closed = True
             self._changed.notify_all()
 
-    def _remember(self, kept: Recent[str, T], id: str, value: T) -> None:
+    def _remember(self, id: str, call: _Call) -> None:
         with self._changed:
-            kept[id] = value
+            self._calls[id] = call
 
     def _advance(self, own: bool, call: _Call, step: Step) -> None:
         if own:
@@ -184,9 +190,13 @@ class Calls:
             call.left.discard(step.replica)
         if call.step is None or call.left:
             return
-        answers = [id for id in step.emitted if MessageId.of(id).port in call.answers]
-        call.payload = self._answers.get(answers[0], b"") if answers else b""
-        call.done = not call.answers or bool(call.payload) or bool(call.step.error)
+        answers = (id for id in step.emitted if MessageId.of(id).port in call.answers)
+        call.answer = call.answer or next(answers, "")
+        self._conclude(call)
+
+    def _conclude(self, call: _Call) -> None:
+        call.payload = self._answers.get(call.answer, b"")
+        call.done = not call.answers or bool(call.payload) or bool(call.step and call.step.error)
 
 
 # ------------------------------------------------------------------------------------------ types of commands

@@ -286,15 +286,27 @@ def test_a_call_that_waits_for_room_when_the_graph_ends_spoils_no_recording(tmp_
     assert str(Recording(finished.recording).verdict) == "COMPLETE", finished.output
 
 
+def publish(port: str, _: object, say: Callable[[str], None]) -> str:
+    id = f"supervisor.{port}#0"
+    say(id)
+    return id
+
+
+def test_an_answer_ends_its_call_though_it_comes_after_its_step() -> None:
+    """It comes from its stage, and the step's from the recorder."""
+    calls = Calls(load_graph(ACCOUNT), publish)
+    id = calls.call(CallRequest("account", "collect", {"count": "1"}))
+    step = Step("account", 0, 0, 0, "on_collect", (("collect", id),), (), 1, 0, 0, 0)
+    calls.note_step(step)
+    calls.note_step(msgspec.structs.replace(step, handler="on_number", consumed=(), emitted=("account.sum#0",)))
+    calls.note_answer("account.sum#0", b"answer")
+    progress = calls.progress(CallQuestion(id, 0))
+    assert (progress.done, progress.answer) == (True, b"answer")
+
+
 def test_a_call_is_done_when_every_replica_has_done_it_even_if_one_failed_before() -> None:
     graph = load_graph(ACCOUNT)
     graph.nodes["account"] = dataclasses.replace(graph.nodes["account"], replicas=2)
-
-    def publish(port: str, _: object, say: Callable[[str], None]) -> str:
-        id = f"supervisor.{port}#0"
-        say(id)
-        return id
-
     calls = Calls(graph, publish)
     id = calls.call(CallRequest("account", "add", {"amount": "1"}))
     step = Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0)
