@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections import deque
@@ -137,8 +138,9 @@ class RecordingWriter:
         self._proof = Proof(json.loads(manifest.graph))
         self._proving = threading.Lock()
         self._file = _create(self._path)
+        self._index_file = _unnamed_file(self._path.parent)
         self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
-        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndex()
+        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndex(self._index_file)
         self._writer.start(profile=PROFILE)
         self._writer.add_metadata(RUN, run_metadata(manifest))
         self._writer.flush()
@@ -216,6 +218,7 @@ class RecordingWriter:
         except BaseException as error:
             self._give_up(error)
         finally:
+            self._index_file.close()
             with contextlib.suppress(OSError):
                 self._file.close()
             self._drop_waiting()
@@ -339,20 +342,23 @@ class RecordingWriter:
 
 
 class _ChunkIndex:
-    """Where the chunks of the file are, as the bytes that stand at its end: the library's objects, 1.6 kB for each of
-    four chunks a second, would be half a gigabyte a day."""
+    """Where the chunks of the file are, in a file without a name until they stand at its end: the library's list would
+    grow with the run, by half a gigabyte a day."""
 
-    def __init__(self) -> None:
-        self._written = RecordBuilder()
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
 
     def append(self, index: ChunkIndex) -> None:
-        index.write(self._written)
+        record = RecordBuilder()
+        index.write(record)
+        self._file.write(record.end())
 
     def __iter__(self) -> Iterator[_ChunkIndex]:
         yield self
 
     def write(self, stream: RecordBuilder) -> None:
-        stream.write(self._written.end())
+        self._file.seek(0)
+        stream.write(self._file.read())
 
 
 def _named(record: Recorded) -> tuple[str, Record]:
@@ -377,6 +383,10 @@ def _create(path: Path) -> IO[bytes]:
         raise Refused(f"recording {path}: cannot be created: {error.strerror}") from None
     hold(file)
     return file
+
+
+def _unnamed_file(folder: Path) -> IO[bytes]:
+    return tempfile.TemporaryFile(buffering=0, dir=folder)
 
 
 _SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, LogLine, Lost)}
