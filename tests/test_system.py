@@ -20,6 +20,7 @@ EVERYWHERE = {"cat", "env", "find", "sh", "sleep"}
 """What every system has."""
 ELSEWHERE = {
     "dora": "the extra `benchmarks` brings it",
+    "cc": "a peer of the tests compiles its codecs; without it they are skipped",
     "ptxas": "NVIDIA's toolkit brings it; tests without it are skipped",
 }
 OURS = {"sys.executable", "RERUN", "str(Path(rerun_cli.__file__).with_name('rerun'))", "str(SCRIPT)"}

@@ -31,7 +31,7 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     policies = {"hosts": "take part", **({"others": "give orders"} if others else {})}
     return {
         "transport/link/protocols": ["tls"],
-        "transport/link/tls": _tls(credentials),
+        "transport/link/tls": tls(credentials),
         **_access(
             "deny", rules, [{"id": name, "cert_common_names": names} for name, names in subjects.items()], policies
         ),
@@ -77,7 +77,7 @@ def _access(default: str, rules: list[Any], subjects: list[Any], policies: dict[
     return {"access_control": {"enabled": True, "default_permission": default, **access}}
 
 
-def _tls(credentials: Credentials) -> dict[str, Any]:
+def tls(credentials: Credentials) -> dict[str, Any]:
     """Both ends of every link show a certificate, and the one that is called must have the address it is called by."""
     sides = ("listen", "connect")
     return {
