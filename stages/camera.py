@@ -1,9 +1,9 @@
-"""Looks, from four sources: the simulated world, a BOP data set, a recording and a RealSense camera."""
+"""Looks, from where there are any: the simulated world, data sets, recordings, ROS 2 bags, cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.devices.ros2.settings import Distribution, Source
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import is_pose
 from stages.messages import Frame, LookRequest, Snapshot
@@ -135,6 +136,44 @@ class RecordedCamera(Stage):
         """The frames in the order in which they were recorded, counted anew."""
         for index, frame in enumerate(self._frames):
             yield msgspec.structs.replace(frame, index=index, total=len(self._frames))
+
+
+class BagCamera(Stage):
+    """Looks out of a ROS 2 bag, MCAP or sqlite3: chosen times, or everything."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """A bag, a folder or a file of it, and its topics."""
+
+        bag: Path
+        topics: Source = field(default_factory=Source)
+        times: tuple[float, ...] = ()
+        """Seconds since the first look of the bag; of each the first look then or later. Empty: all looks."""
+        period: float = 0.0
+        """Where no times are chosen: at least so many seconds from one look to the next."""
+        distribution: Distribution = "jazzy"
+
+        def __post_init__(self) -> None:
+            for time in (*self.times, self.period):
+                if not time >= 0:
+                    raise Refused(f"camera: {time:g} s: times and period must be 0 or more")
+
+    def __init__(self, config: Config) -> None:
+        from stages.devices.ros2.bag import Bag
+
+        self._bag = Bag(config.bag, config.topics, config.distribution, times=config.times, period=config.period)
+
+    def source(self, ctx: Context) -> Iterator[Frame]:
+        """The looks, by time."""
+        if self._bag.left_out:
+            ctx.log(f"{len(self._bag.left_out)} looks are left out: {self._bag.left_out[0]}", level="warning")
+        yield from (self._bag.look(index) for index in range(len(self._bag)))
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._bag.close()
 
 
 class RealSenseCamera(Stage):

@@ -1,4 +1,4 @@
-"""Scene estimates out to disk: BOP results and a scene graph per image."""
+"""Scene estimates out to disk: a scene graph per look, BOP results."""
 
 from __future__ import annotations
 
@@ -10,7 +10,27 @@ from runner.contract import Context, Finished, Refused, Stage
 from stages.devices.bop_results import HEADER, Result, write_scene_graph
 from stages.messages import Frame, SceneEstimate, SceneGraph
 from stages.scene.catalogue import Catalogue
-from stages.scene.text import certainty
+from stages.scene.text import certainty, tree
+
+
+class SceneGraphs(Stage):
+    """Says the scene graph of every look, and writes it beside the recording; ends the graph after the last look."""
+
+    device = True
+
+    def __init__(self) -> None:
+        self._written = 0
+
+    def on_scene_graph(
+        self, frame: Frame, scene_estimate: SceneEstimate, scene_graph: SceneGraph, ctx: Context
+    ) -> Finished | None:
+        """One look: what stands on what, and how sure that is."""
+        write_scene_graph(ctx.directory / f"look-{frame.index:04d}.json", scene_graph)
+        ctx.log("\n".join([f"{frame.name}{_said(scene_estimate)}", *tree(scene_graph)]))
+        self._written += 1
+        if self._written == frame.total:
+            return Finished(code=0, reason=f"looks: {self._written}, scene graphs in {ctx.directory}")
+        return None
 
 
 class BopResults(Stage):

@@ -28,6 +28,7 @@ SOURCE = ("runner", "stages", "graphs", "graph.yaml", "pyproject.toml", "README.
 GRAPHS = {
     "tray": (),
     "interactive": (),
+    "bag": ("--set", "camera.bag=d"),
     "reference": (),
     "photos": ("--set", "camera.dataset=d", "--set", "results.path=d.csv"),
     "bop": ("--set", "camera.dataset=d", "--set", "detector.detections=d.json", "--set", "results.path=d.csv"),

@@ -49,3 +49,5 @@ class Frame(Message, frozen=True, kw_only=True):
     image_id: int = 0
     n_objects: int | None = None
     """Number of objects where the source knows it (a data set's targets)."""
+    stamp_ns: int = 0
+    """When the image was taken, nanoseconds by the camera's clock; 0 where the source does not say."""

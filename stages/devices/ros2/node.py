@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from runner.contract import Refused
 from runner.graph.placement import Credentials
 from runner.hosts.keys import credentials
 from runner.transport.security import tls
-from stages.devices.ros2.types import Distribution, Types, matching
+from stages.devices.ros2.settings import Link
+from stages.devices.ros2.types import Types, matching
 from stages.devices.ros2.wire import COUNTERPART, TOKENS, Attachment, Endpoint, Kind, Owner, Qos, full_name
 
 CALL_SECONDS = 10.0
@@ -28,24 +29,6 @@ HEARTBEAT_SECONDS = 0.5
 _SHOWN = 8
 """Names in a message to people."""
 _DOES: Mapping[Kind, str] = {"MP": "publishes", "MS": "subscribes to", "SS": "serves", "SC": "calls"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Link:
-    """Where the nodes of a lab meet, and who this one is among them."""
-
-    router: str = "tcp/localhost:7447"
-    """Endpoint of the Zenoh router: ``tcp/HOST:PORT``, or ``tls/HOST:PORT`` with ``keys``."""
-    keys: Path | None = None
-    """Folder with ca.pem, cert.pem and key.pem of this machine, as ``runner keys`` writes them."""
-    domain: int = 0
-    """ROS_DOMAIN_ID."""
-    namespace: str = "/"
-    node: str = "scene_programming"
-    remap: dict[str, str] = field(default_factory=dict[str, str])
-    """Other names for topics and services."""
-    distribution: Distribution = "jazzy"
-    """Of the other nodes: jazzy, kilted or lyrical."""
 
 
 @dataclass(frozen=True, slots=True)

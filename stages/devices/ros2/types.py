@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,9 +20,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from runner.contract import Refused
+from stages.devices.ros2.settings import DISTRIBUTIONS, Distribution
 
-Distribution = Literal["jazzy", "kilted", "lyrical"]
-DISTRIBUTIONS: tuple[Distribution, ...] = get_args(Distribution)
 _INTERFACES = Path(__file__).with_name("interfaces.yaml")
 _Fields = list[tuple[str, Any]]
 """(name, description as rosbags has it) of each field."""

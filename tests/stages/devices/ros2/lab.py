@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from stages.devices.ros2.node import Link, Node
+from stages.devices.ros2.node import Node
 from stages.devices.ros2.services import Request, serve
+from stages.devices.ros2.settings import Link
 from stages.devices.ros2.wire import LATCHED
 
 TRAJECTORY = "control_msgs/action/FollowJointTrajectory"

@@ -9,8 +9,9 @@ from runner.contract import Refused
 from runner.graph.placement import Host
 from runner.hosts.keys import credentials, make_keys
 from runner.transport.security import tls
-from stages.devices.ros2.node import Link, Node, Received
+from stages.devices.ros2.node import Node, Received
 from stages.devices.ros2.services import ActionClient, Client, Request, Unanswered, serve
+from stages.devices.ros2.settings import Link
 from stages.devices.ros2.wire import LATCHED
 from tests.stages.devices.ros2.lab import TRAJECTORY, ActionServer, free_port, node, open_router, router, wait_until
 

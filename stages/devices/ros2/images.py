@@ -1,0 +1,144 @@
+"""Pixels of ROS 2 images: colour as bytes, depth in metres, lenses taken out.
+
+Encodings: sensor_msgs/image_encodings.hpp; compressed depth: compressed_depth_image_transport; RVL: Wilson, Fast
+Lossless Depth Image Compression (2017). What cannot be read raises ValueError, with the encoding that was found.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.messages.arrays import Depth, Intrinsics, Rgb
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_COLORS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
+"""By encoding: channels, and where red, green and blue are."""
+_DEPTHS = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
+_FISHEYE = "equidistant"
+_LENSES = ("plumb_bob", "rational_polynomial", _FISHEYE)
+_DEPTH_HEADER = struct.Struct("<iff")
+_RVL_HEADER = struct.Struct("<II")
+
+
+def color(message: Any) -> Rgb:
+    """H x W x 3 of an Image or CompressedImage."""
+    if message.__msgtype__ == COMPRESSED:
+        pixels = _unpacked(message.data, cv2.IMREAD_COLOR, message.format)
+        return np.ascontiguousarray(pixels[:, :, ::-1])
+    if message.encoding not in _COLORS:
+        raise ValueError(f"encoding {message.encoding!r} is no colour that is read; valid: {', '.join(_COLORS)}")
+    channels, order = _COLORS[message.encoding]
+    return np.ascontiguousarray(_rows(message, np.dtype(np.uint8), channels)[:, :, order])
+
+
+def depth(message: Any) -> Depth:
+    """H x W of an Image or of compressedDepth, metres along the optical axis; 0 where there is no reading."""
+    if message.__msgtype__ == COMPRESSED:
+        return _compressed_depth(message)
+    if message.encoding not in _DEPTHS:
+        raise ValueError(f"encoding {message.encoding!r} is no depth that is read; valid: {', '.join(_DEPTHS)}")
+    return _metres(_rows(message, _DEPTHS[message.encoding], 1)[:, :, 0])
+
+
+class Lens:
+    """What a CameraInfo says: the pinhole matrix of rectified pixels, and how to get these."""
+
+    def __init__(self, info: Any, *, rectified: bool) -> None:
+        """``rectified`` says that the images are so already. Raises ValueError for a lens of unknown kind."""
+        self.size = (int(info.height), int(info.width))
+        pinhole = np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3))
+        self.K: Intrinsics = np.array(pinhole, np.float64)
+        if not (self.K[0, 0] > 0 and self.K[1, 1] > 0):
+            raise ValueError("no focal length: the camera is not calibrated")
+        self._maps = None if rectified or not np.any(info.d) else self._bent(info)
+
+    def straighten(self, rgb: Rgb, metres: Depth) -> tuple[Rgb, Depth]:
+        """Colour and depth as a pinhole camera of matrix K sees them; 0 beyond their rims."""
+        if self._maps is None:
+            return rgb, metres
+        return (
+            np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), np.uint8),
+            np.asarray(cv2.remap(metres, *self._maps, cv2.INTER_NEAREST), np.float32),
+        )
+
+    def _bent(self, info: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+        if info.distortion_model not in _LENSES:
+            raise ValueError(f"distortion model {info.distortion_model!r} is not known; valid: {', '.join(_LENSES)}")
+        undistort: Any = cv2.fisheye if info.distortion_model == _FISHEYE else cv2
+        size = self.size[::-1]
+        return undistort.initUndistortRectifyMap(self.K, np.array(info.d), np.eye(3), self.K, size, cv2.CV_32FC1)
+
+
+def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """H x W x channels; lines may be longer than their pixels."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    used = width * channels * dtype.itemsize
+    if step < used or len(message.data) < height * step:
+        raise ValueError(
+            f"{len(message.data)} bytes in lines of {step} do not hold {width} x {height} pixels of {message.encoding}"
+        )
+    lines = message.data[: height * step].reshape(height, step)[:, :used]
+    order = dtype.newbyteorder(">" if message.is_bigendian else "<")
+    return np.ascontiguousarray(lines).view(order).reshape(height, width, channels)
+
+
+def _metres(values: NDArray[Any]) -> Depth:
+    """Whole numbers are millimetres."""
+    if values.dtype.kind == "u":
+        return (values / np.float32(1000)).astype(np.float32)
+    return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+
+def _compressed_depth(message: Any) -> Depth:
+    """``ENCODING; compressedDepth [png|rvl]``: twelve bytes of parameters, then the image."""
+    encoding, _, how = (part.strip() for part in message.format.partition(";"))
+    transport, _, codec = how.partition(" ")
+    if transport != "compressedDepth" or encoding not in _DEPTHS or codec not in ("", "png", "rvl"):
+        raise ValueError(f"format {message.format!r} is no depth that is read; valid: '16UC1; compressedDepth png'")
+    if len(message.data) < _DEPTH_HEADER.size:
+        raise ValueError(f"compressed depth of {len(message.data)} bytes has no header")
+    packed = message.data[_DEPTH_HEADER.size :]
+    values = _rvl(packed.tobytes()) if codec == "rvl" else _unpacked(packed, cv2.IMREAD_UNCHANGED, message.format)
+    if _DEPTHS[encoding].kind == "u":
+        return _metres(values)
+    _, a, b = _DEPTH_HEADER.unpack(message.data[: _DEPTH_HEADER.size].tobytes())
+    inverse = values.astype(np.float32)
+    return _metres(np.divide(a, inverse - b, out=np.zeros_like(inverse), where=values > 0))
+
+
+def _unpacked(data: NDArray[np.uint8], flags: int, format: str) -> NDArray[Any]:
+    pixels: Any = cv2.imdecode(data, flags) if len(data) else None
+    if pixels is None:
+        raise ValueError(f"{len(data)} bytes of format {format!r} are no image")
+    return pixels
+
+
+def _rvl(data: bytes) -> NDArray[np.uint16]:
+    """Runs of zeros and of differences; numbers of three bits a nibble, low ones first, bit 3 where more follow."""
+    if len(data) < _RVL_HEADER.size + 4:
+        raise ValueError(f"RVL of {len(data)} bytes has no pixels")
+    columns, rows = _RVL_HEADER.unpack_from(data)
+    words = np.frombuffer(data, "<u4", offset=_RVL_HEADER.size, count=(len(data) - _RVL_HEADER.size) // 4)
+    nibbles = (words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)).ravel() & 15
+    ends = np.flatnonzero(nibbles < 8)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    numbers = np.add.reduceat((nibbles[: ends[-1] + 1].astype(np.int64) & 7) << (3 * place), starts)
+    changes = np.zeros(rows * columns, np.int64)
+    filled = np.zeros(rows * columns, np.bool_)
+    pixel = number = 0
+    while pixel < len(changes):
+        if number + 1 >= len(numbers):
+            raise ValueError(f"RVL of {columns} x {rows} pixels ends after {pixel}")
+        pixel += int(numbers[number])
+        count = int(numbers[number + 1])
+        coded = numbers[number + 2 : number + 2 + count]
+        changes[pixel : pixel + count] = (coded >> 1) ^ -(coded & 1)
+        filled[pixel : pixel + count] = True
+        pixel, number = pixel + count, number + 2 + count
+    return np.where(filled, np.cumsum(changes), 0).astype(np.uint16).reshape(rows, columns)

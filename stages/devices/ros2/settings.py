@@ -1,0 +1,51 @@
+"""Settings of stages that speak with ROS 2; whoever reads a graph loads no more of it than this."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+Distribution = Literal["jazzy", "kilted", "lyrical"]
+DISTRIBUTIONS: tuple[Distribution, ...] = get_args(Distribution)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """Where the nodes of a lab meet, and who this one is among them."""
+
+    router: str = "tcp/localhost:7447"
+    """Endpoint of the Zenoh router: ``tcp/HOST:PORT``, or ``tls/HOST:PORT`` with ``keys``."""
+    keys: Path | None = None
+    """Folder with ca.pem, cert.pem and key.pem of this machine, as ``runner keys`` writes them."""
+    domain: int = 0
+    """ROS_DOMAIN_ID."""
+    namespace: str = "/"
+    node: str = "scene_programming"
+    remap: dict[str, str] = field(default_factory=dict[str, str])
+    """Other names for topics and services."""
+    distribution: Distribution = "jazzy"
+    """Of the other nodes: jazzy, kilted or lyrical."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Topics of a camera whose depth is registered to its colour."""
+
+    color: str = "/camera/camera/color/image_raw"
+    """Image, or CompressedImage where the name ends in /compressed."""
+    depth: str = "/camera/camera/aligned_depth_to_color/image_raw"
+    """Image, or CompressedImage where the name ends in /compressedDepth."""
+    info: str = "/camera/camera/color/camera_info"
+    rectified: bool = False
+    """The images are rectified already: their lens is not taken out, and K is that of the projection matrix."""
+    slop: float = 0.005
+    """Seconds by which the stamps of colour and depth may differ."""
+    base_frame: str | None = "base_link"
+    """The robot's base among the transforms. None where nobody knows how the camera stands to it: poses are in the
+    table's frame, and nothing is planned in them."""
+
+    @property
+    def images(self) -> tuple[str, str]:
+        """The topics of colour and depth."""
+        return self.color, self.depth
