@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
-from stages.devices.ros2.settings import Distribution, Source
+from stages.devices.ros2.settings import Distribution, Link, Patience, Source
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import is_pose
 from stages.messages import Frame, LookRequest, Snapshot
@@ -174,6 +174,38 @@ class BagCamera(Stage):
     def close(self) -> None:
         """Closes the file."""
         self._bag.close()
+
+
+class Ros2Camera(Stage):
+    """A camera that ROS 2 nodes publish: answers each request with the next image of a camera that stands still."""
+
+    device: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """Where the camera is, its topics, and how long to wait for it."""
+
+        link: Link = field(default_factory=lambda: Link(node="scene_camera"))
+        topics: Source = field(default_factory=Source)
+        patience: Patience = field(default_factory=Patience)
+
+    def __init__(self, config: Config) -> None:
+        from stages.devices.ros2.live import LiveCamera
+
+        self._camera = LiveCamera(config.link, config.topics, config.patience)
+        self._looks = 0
+
+    def on_look_request(self, look_request: LookRequest, ctx: Context) -> Frame:
+        """The image, from where the transforms at its stamp say that the camera is."""
+        frame = self._camera.look(
+            name=look_request.purpose, index=self._looks, say=lambda text: ctx.log(text, level="warning")
+        )
+        self._looks += 1
+        return frame
+
+    def close(self) -> None:
+        """Leaves the ROS graph."""
+        self._camera.close()
 
 
 class RealSenseCamera(Stage):

@@ -49,3 +49,16 @@ class Source:
     def images(self) -> tuple[str, str]:
         """The topics of colour and depth."""
         return self.color, self.depth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Patience:
+    """How long to wait, and for what, seconds."""
+
+    warn: float = 5.0
+    """Until it is said why there is no look, and again each time."""
+    give_up: float = 60.0
+    max_age: float = 1.0
+    """Between an image's stamp and its arrival by this machine's clock: more is an image of another time."""
+    settle: float = 0.2
+    """For so long the camera must have stood where it stands in the image."""
