@@ -17,8 +17,9 @@ their annotations:
 * a parameter annotated :class:`Context` receives the step's context.
 
 Only stages marked ``device`` touch the outside (sensors, simulators, files, wall clock). A device may also
-define ``source(self, ctx) -> Iterator[Message]``, which is advanced between inputs. Replay re-executes every
-other stage and substitutes what devices emitted.
+define ``source(self, ctx) -> Iterator[Message]``, which is advanced between inputs; one that has handlers too yields
+None, after a moment, where there is nothing yet. Replay re-executes every other stage and substitutes what devices
+emitted.
 """
 
 from __future__ import annotations

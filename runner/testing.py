@@ -114,7 +114,8 @@ class Bench:
         """Runs the source, where there is one, to its end; each message is a step."""
         if (source := self.node.type.source) is not None:
             for draft in self._executor.advance(source, time.time_ns):
-                yield Done(Ready(source, ()), [draft.envelope])
+                if draft is not None:
+                    yield Done(Ready(source, ()), [draft.envelope])
 
     def say_what_is_left(self) -> None:
         """Logs what was never worked on."""

@@ -13,6 +13,7 @@ import msgspec
 from runner.contract import Context, Refused, Stage
 from stages.messages import (
     Arrangement,
+    Asked,
     Assertion,
     Goal,
     LookRequest,
@@ -320,6 +321,26 @@ class Demonstrator(Stage):
             plans=state.plans,
             transfers=state.transfers,
         )
+
+
+class AskedDemonstrator(Demonstrator):
+    """Does what a device is asked from outside as well as what is called."""
+
+    def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Verdict:
+        """Teaches or restores; what cannot be done is a verdict, for somebody waits for one."""
+        try:
+            if asked.kind == "teach":
+                return self.on_teach(Teach(name=asked.name), ctx)
+            return self.on_restore(Restore(name=asked.name), ctx)
+        except Refused as refusal:
+            return Verdict(
+                goal_name=asked.name,
+                success=False,
+                failed_stage="demonstrator",
+                reason=str(refusal),
+                satisfied=(),
+                violated=(),
+            )
 
 
 def _names(scene: SceneGraph) -> set[str]:

@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from colorsys import hsv_to_rgb
 from dataclasses import replace
+from functools import cached_property
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,6 +67,10 @@ from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.relations import TABLE
 from stages.scene.text import SURE, support
+
+if TYPE_CHECKING:  # only an export speaks with ROS 2
+    from runner.view.ros2_bag import BagMessage
+    from stages.devices.ros2.recorded import RecordedScenes
 
 MOTION_FRAMES = 8
 """Postures shown of one robot motion."""
@@ -161,6 +166,16 @@ class Views:
                 yield from self._motion(message)
             case _:
                 yield from self._task(message)
+
+    def ros2(self, message: Message, time_ns: int) -> Iterator[BagMessage]:
+        """What one message is in ROS 2: images and intrinsics, transforms, detections, markers, the scene graph."""
+        return self._recorded.told(message, time_ns)
+
+    @cached_property
+    def _recorded(self) -> RecordedScenes:
+        from stages.devices.ros2.recorded import RecordedScenes
+
+        return RecordedScenes(self._catalogue)
 
     def _task(self, message: Message) -> Iterator[Drawing]:
         if isinstance(message, Goal):

@@ -29,6 +29,7 @@ GRAPHS = {
     "tray": (),
     "interactive": (),
     "bag": ("--set", "camera.bag=d"),
+    "ros2": (),
     "reference": (),
     "photos": ("--set", "camera.dataset=d", "--set", "results.path=d.csv"),
     "bop": ("--set", "camera.dataset=d", "--set", "detector.detections=d.json", "--set", "results.path=d.csv"),
@@ -104,7 +105,9 @@ def key(name: str) -> str:
 
 
 def test_what_the_runner_imports_is_installed_with_it():
-    assert undeclared("runner", *PROJECT["dependencies"], *EXTRAS["view"], *EXTRAS["foxglove"]) == set()
+    assert (
+        undeclared("runner", *PROJECT["dependencies"], *EXTRAS["view"], *EXTRAS["foxglove"], *EXTRAS["ros2"]) == set()
+    )
 
 
 def test_only_views_import_what_their_extras_bring():

@@ -2,7 +2,6 @@
 
 import contextlib
 import gc
-import itertools
 import os
 import signal
 import sys
@@ -338,18 +337,20 @@ class StageProcess:
         self._log(str(refusal), "warning")
 
     def _advance(self, handler: Handler) -> Iterator[bool]:
-        """Sends the next message of the source each time it is advanced; every message is a step."""
+        """Sends the next message of the source each time it is advanced, if it has one; every message is a step."""
         emissions = self._executor.advance(handler, time.time_ns)
         while True:
             self._present = record = _Record(Ready(handler, ()), time.time_ns())
-            for draft in record.timed(itertools.islice(emissions, 1)):
+            for draft in record.timed(emissions):
                 record.time_ns = draft.envelope.time_ns
                 with contextlib.suppress(Stopped):
                     self._emit(draft)
+                break
             self._present = None
-            if not record.emitted:
+            if record.ended:
                 return
-            self._journal(record)
+            if record.emitted:
+                self._journal(record)
             yield True
 
     def _emit(self, draft: Draft) -> None:
@@ -412,6 +413,8 @@ class _Record:
         self._begun_ns = 0
         """When the handler went on; 0 while it is held back."""
         self.time_ns = time_ns
+        self.ended = False
+        """The handler emits no more."""
         self.emitted: list[str] = []
         self.outcome: Outcome = "done"
         self.error = ""
@@ -432,12 +435,15 @@ class _Record:
         begun = self._begun_ns
         return self._computed_ns + (time.monotonic_ns() - begun if begun else 0)
 
-    def timed(self, emissions: Iterator[Draft]) -> Iterator[Draft]:
-        """Passes emissions on, noting their ids and the time the handler took for them."""
+    def timed(self, emissions: Iterator[Draft | None]) -> Iterator[Draft]:
+        """Passes emissions on up to a None, noting their ids and the time the handler took for them."""
         while True:
             self._begun_ns = time.monotonic_ns()
             try:
-                draft = next(emissions, None)
+                draft = next(emissions)
+            except StopIteration:
+                self.ended = True
+                return
             finally:
                 self._computed_ns, self._begun_ns = self.busy_ns, 0
             if draft is None:

@@ -112,13 +112,13 @@ class Executor:
         for message in _messages(getattr(self._stage, handler.name)(**arguments)):
             yield self._draft(message, driver, causes, context.time_ns, taken)
 
-    def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft]:
-        """Yields the messages of a device's source; each is a step of its own at the clock's time."""
+    def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft | None]:
+        """Yields the messages of a device's source, each a step of its own at the clock's time; None as it does."""
         context = self._context(handler, None, clock())
         arguments = {} if handler.context is None else {handler.context: context}
         for message in getattr(self._stage, handler.name)(**arguments):
             context.time_ns = clock()
-            yield self._draft(message, None, (), context.time_ns, set())
+            yield None if message is None else self._draft(message, None, (), context.time_ns, set())
 
     def _context(self, handler: Handler, driver: Envelope | None, time_ns: int) -> StepContext:
         identity = handler.name if driver is None else driver.id

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,8 +71,13 @@ def _parsed(path: Path, number: int, row: dict[str, str]) -> Result:
 
 
 def write_scene_graph(path: Path, graph: SceneGraph) -> None:
-    """Writes assertions as text and poses as numbers, JSON; ``frame`` says what the poses are relative to."""
-    content = {
+    """Writes a scene graph as JSON."""
+    path.write_text(json.dumps(scene_graph_content(graph), indent=1) + "\n")
+
+
+def scene_graph_content(graph: SceneGraph) -> dict[str, Any]:
+    """Assertions as text and poses as numbers; ``frame`` says what the poses are relative to."""
+    return {
         "scene_id": graph.scene_id,
         "im_id": graph.image_id,
         "frame": graph.frame,
@@ -82,4 +88,3 @@ def write_scene_graph(path: Path, graph: SceneGraph) -> None:
             for item in graph.virtual_objects
         },
     }
-    path.write_text(json.dumps(content, indent=1) + "\n")

@@ -9,6 +9,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
 from stages.messages.robot import RobotCommand, RobotState
+from stages.messages.ros2 import Asked, Look, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, Snapshot
 from stages.messages.task import (
@@ -28,6 +29,7 @@ from stages.messages.task import (
 __all__ = [
     "Arrange",
     "Arrangement",
+    "Asked",
     "Assertion",
     "Box",
     "Candidate",
@@ -37,6 +39,7 @@ __all__ = [
     "Goal",
     "Hypothesis",
     "Intrinsics",
+    "Look",
     "LookRequest",
     "Mask",
     "ObjectPose",
@@ -51,6 +54,8 @@ __all__ = [
     "Rgb",
     "RobotCommand",
     "RobotState",
+    "Ros2Message",
+    "Ros2Sent",
     "SceneEstimate",
     "SceneGraph",
     "Snapshot",

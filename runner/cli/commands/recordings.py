@@ -35,7 +35,11 @@ def add_commands(commands: Commands) -> None:
     export = add(commands, "export", _export, "write what a recording shows in the format of another tool")
     add_file(export)
     text = "an MCAP file of Foxglove messages: images, cameras, point clouds, transforms, scenes and logs"
-    export.add_argument("--foxglove", type=Path, metavar="OUT", required=True, help=text)
+    formats = export.add_mutually_exclusive_group(required=True)
+    formats.add_argument("--foxglove", type=Path, metavar="OUT", help=text)
+    formats.add_argument(
+        "--ros2", type=Path, metavar="OUT", help="a ROS 2 bag, a folder, of what the graph's views say"
+    )
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -87,6 +91,11 @@ def _diff(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> None:
+    if options.ros2 is not None:
+        from runner.view.ros2_bag import export_bag
+
+        print(*export_bag(options.file, options.ros2), sep="\n")
+        return
     from runner.view.export import export
 
     if options.foxglove.suffix != ".mcap":

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from stages.devices.ros2.node import Node, Received
-from stages.devices.ros2.wire import LATCHED, Attachment, Qos
+from stages.devices.ros2.wire import LATCHED, Attachment, Endpoint, Qos
 
 LONG_SECONDS = 30 * 24 * 3600.0
 """How long Zenoh waits for the result of an action, which may take as long as it takes."""
@@ -32,12 +32,15 @@ class Unanswered(Exception):
 class Request:
     """A call of this node's service, to be answered once, now or later."""
 
-    def __init__(self, query: zenoh.Query, message: Any, attachment: Attachment, node: Node, key: str) -> None:
+    def __init__(
+        self, query: zenoh.Query, message: Any, attachment: Attachment, node: Node, endpoint: Endpoint
+    ) -> None:
         self.message = message
+        self.service = endpoint.topic
         self._query = query
         self._attachment = attachment
         self._node = node
-        self._key = key
+        self._key = endpoint.key
 
     def answer(self, response: Any) -> None:
         """Sends the response to who asked."""
@@ -60,7 +63,7 @@ def serve(node: Node, name: str, type: str, take: Callable[[Request], None]) -> 
             query.reply_err(str(error))
             query.drop()
             return
-        take(Request(query, message, attachment, node, endpoint.key))
+        take(Request(query, message, attachment, node, endpoint))
 
     node.keep(node.session.declare_queryable(endpoint.key, on_query, complete=True))
 

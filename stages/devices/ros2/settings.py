@@ -62,3 +62,13 @@ class Patience:
     """Between an image's stamp and its arrival by this machine's clock: more is an image of another time."""
     settle: float = 0.2
     """For so long the camera must have stood where it stands in the image."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frames:
+    """Names of frames among the lab's transforms."""
+
+    base: str = "base_link"
+    """What poses are given in, where it is known how the camera stands to the robot."""
+    camera: str = "camera_color_optical_frame"
+    """Of the colour camera; else poses are in the table's frame, which hangs on this one."""

@@ -1,0 +1,91 @@
+"""Writes what the views of a recording's graph say to ROS 2 into a bag that its tools read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+from runner.contract import Message, Refused
+from runner.graph.graph import Graph, graph_from_json
+from runner.message.codec import open_envelope
+from runner.message.ids import MessageId
+from runner.recording.recording import Recording
+from runner.view.views import load_views
+
+if TYPE_CHECKING:
+    from rosbags import rosbag2
+    from rosbags.interfaces import Connection
+else:
+    try:
+        from rosbags import rosbag2
+    except ImportError:
+        rosbag2 = None
+
+_VERSION = 9
+"""Of the bag's format: Kilted's; Jazzy reads it too."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """A message of a topic, with all that a bag must know of its type."""
+
+    topic: str
+    type: str
+    """``package/msg/Name``."""
+    definition: str
+    """Its text and that of all it is made of."""
+    hash: str
+    """RIHS01."""
+    data: bytes
+    """XCDR1."""
+
+
+@runtime_checkable
+class Ros2Views(Protocol):
+    """Views that also say what a message is in ROS 2."""
+
+    def ros2(self, message: Message, time_ns: int) -> Iterable[BagMessage]:
+        """What one message is, in recorded order; ``time_ns`` is when it was recorded. Nothing for most messages."""
+        ...
+
+
+def export_bag(path: Path, target: Path) -> list[str]:
+    """Writes a bag, a new folder; returns lines that say what was written.
+
+    Raises Refused where rosbags is missing, the file is no recording, its views say nothing or the target exists.
+    """
+    if rosbag2 is None:
+        raise Refused("runner export: rosbags is missing; type: pip install 'scene-programming[ros2]'")
+    recording = Recording(path)
+    graph = graph_from_json(recording.run["graph"], str(path))
+    views = load_views(graph)
+    if not isinstance(views, Ros2Views):
+        raise Refused(f"{path}: its views {graph.view} say nothing to ROS 2; they have no method ros2")
+    counts: Counter[str] = Counter()
+    try:
+        with rosbag2.Writer(target, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+            connections: dict[str, Connection] = {}
+            for time_ns, one in _said(recording, graph, views):
+                if one.topic not in connections:
+                    connections[one.topic] = writer.add_connection(
+                        one.topic, one.type, msgdef=one.definition, rihs01=one.hash
+                    )
+                writer.write(connections[one.topic], time_ns, one.data)
+                counts[one.topic] += 1
+    except (rosbag2.WriterError, OSError) as error:
+        raise Refused(f"{target}: cannot be written: {error}") from None
+    written = [f"{target}: {count} messages of {topic}" for topic, count in sorted(counts.items())]
+    return [f"{path}: {recording.verdict}", *(written or [f"{target}: nothing to say"])]
+
+
+def _said(recording: Recording, graph: Graph, views: Ros2Views) -> Iterator[tuple[int, BagMessage]]:
+    """In the order of recording, with the times of it."""
+    for id, message in recording.messages.items():
+        name = MessageId.of(id)
+        kind = graph.outputs_of(name.stage).get(name.port)
+        if kind is not None:
+            for one in views.ros2(open_envelope(kind, recording.envelope(id)), message.log_time_ns):
+                yield message.log_time_ns, one

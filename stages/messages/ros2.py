@@ -1,0 +1,42 @@
+"""What is said to ROS 2 nodes, and asked by them."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.contract import Command, Message, Spec, Struct
+
+Bytes = Annotated[NDArray[np.uint8], Spec("uint8", ("N",))]
+
+
+class Ros2Message(Struct, frozen=True, kw_only=True):
+    """A message of a topic, or the answer of a service."""
+
+    topic: str
+    """Whole name of the topic or the service."""
+    type: str
+    """``package/msg/Name``, or with ``srv``."""
+    data: Bytes
+    """XCDR1, as it was sent."""
+
+
+class Ros2Sent(Message, frozen=True, kw_only=True):
+    """What a stage has published and answered in one step."""
+
+    messages: tuple[Ros2Message, ...]
+
+
+class Asked(Message, frozen=True, kw_only=True):
+    """A ROS 2 node has called a service: what the demonstrator shall do."""
+
+    kind: Literal["teach", "restore"]
+    name: str
+    """Of the goal."""
+
+
+class Look(Command, frozen=True, kw_only=True):
+    """Takes a look, whose scene is published."""
+
+    purpose: str = "look"
+    """Shown to people."""
