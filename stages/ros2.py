@@ -134,15 +134,15 @@ class Ros2Demonstration(_Publisher):
         self._waiting: tuple[Asked, Request] | None = None
         """What is asked of the demonstrator, and who waits for it."""
 
-    def source(self, ctx: Context) -> Iterator[Asked | None]:
+    def source(self, ctx: Context) -> Iterator[Asked | Ros2Sent | None]:
         """What nodes ask for, one thing at a time; who comes meanwhile is told so."""
         while True:
             service, request = self._outlet.request() or (None, None)
             if service is None or request is None:
                 yield None
             elif self._waiting is not None:
-                busy = self._waiting[0]
-                self._outlet.answer(request, success=False, message=f"busy: {busy.kind} {busy.name} is under way")
+                busy = f"busy: {self._waiting[0].kind} {self._waiting[0].name} is under way"
+                yield Ros2Sent(messages=(self._outlet.answer(request, success=False, message=busy),))
             else:
                 asked = self._services[service]
                 self._waiting = asked, request
