@@ -15,7 +15,6 @@ from stages.messages import (
     Goal,
     Look,
     LookRequest,
-    Ros2Message,
     Ros2Sent,
     SceneEstimate,
     SceneGraph,
@@ -28,30 +27,10 @@ if TYPE_CHECKING:  # whoever reads a graph does not load what speaks with ROS 2
     from stages.devices.ros2.services import Request
 
 
-class _Publisher(Stage):
-    """A node that publishes every scene: what both stages below have in common."""
+class Ros2Scenes(Stage):
+    """Takes looks when ROS 2 nodes or people ask for them, and publishes their scenes."""
 
     device: ClassVar[bool] = True
-
-    def __init__(self, link: Link, catalogue: Path, frames: Frames, services: tuple[str, ...]) -> None:
-        from stages.devices.ros2.outgoing import Scenes
-        from stages.devices.ros2.outlet import Outlet
-
-        self._outlet = Outlet(link, services)
-        self._scenes = Scenes(self._outlet.types, Catalogue.shared(catalogue), frames)
-
-    def close(self) -> None:
-        """Leaves the ROS graph."""
-        self._outlet.close()
-
-    def _publish(self, frame: Frame, estimate: SceneEstimate, graph: SceneGraph, ctx: Context) -> list[Ros2Message]:
-        for warning in self._outlet.warnings():
-            ctx.log(warning, level="warning")
-        return self._outlet.publish(self._scenes.scene(estimate, graph, frame.stamp_ns or ctx.time_ns))
-
-
-class Ros2Scenes(_Publisher):
-    """Takes looks when ROS 2 nodes or people ask for them, and publishes their scenes."""
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
@@ -68,7 +47,9 @@ class Ros2Scenes(_Publisher):
                 raise Refused(f"ros2.every = {self.every}: must be 0 or more seconds, or null")
 
     def __init__(self, config: Config) -> None:
-        super().__init__(config.link, config.catalogue, config.frames, ("~/look",))
+        from stages.devices.ros2.outlet import Outlet
+
+        self._outlet = Outlet(config.link, config.frames, Catalogue.shared(config.catalogue), ("~/look",))
         self._every = config.every
         self._looks = 0
         self._waiting: dict[str, Request] = {}
@@ -98,7 +79,7 @@ class Ros2Scenes(_Publisher):
         self, frame: Frame, scene_estimate: SceneEstimate, scene_graph: SceneGraph, ctx: Context
     ) -> Ros2Sent:
         """Publishes a scene, and answers who asked for it."""
-        sent = self._publish(frame, scene_estimate, scene_graph, ctx)
+        sent = self._outlet.publish(frame, scene_estimate, scene_graph, ctx)
         text = sentence(scene_graph)
         ctx.log(f"{frame.name}: {text}")
         request = self._waiting.pop(frame.name, None)
@@ -108,13 +89,19 @@ class Ros2Scenes(_Publisher):
             self._due_ns = ctx.time_ns + int(self._every * 1e9)
         return Ros2Sent(messages=tuple(sent))
 
+    def close(self) -> None:
+        """Leaves the ROS graph."""
+        self._outlet.close()
+
     def _look(self, purpose: str) -> LookRequest:
         self._looks += 1
         return LookRequest(purpose=f"look {self._looks}: {purpose}")
 
 
-class Ros2Demonstration(_Publisher):
+class Ros2Demonstration(Stage):
     """Has goals taught and restored when ROS 2 nodes call services, and publishes every scene on the way."""
+
+    device: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
@@ -127,10 +114,12 @@ class Ros2Demonstration(_Publisher):
         """Each has two services of type std_srvs/srv/Trigger: ``~/teach/GOAL`` and ``~/restore/GOAL``."""
 
     def __init__(self, config: Config) -> None:
+        from stages.devices.ros2.outlet import Outlet
+
         self._services = {
             f"~/{kind}/{name}": Asked(kind=kind, name=name) for kind in ("teach", "restore") for name in config.goals
         }
-        super().__init__(config.link, config.catalogue, config.frames, tuple(self._services))
+        self._outlet = Outlet(config.link, config.frames, Catalogue.shared(config.catalogue), tuple(self._services))
         self._waiting: tuple[Asked, Request] | None = None
         """What is asked of the demonstrator, and who waits for it."""
 
@@ -152,7 +141,7 @@ class Ros2Demonstration(_Publisher):
         self, frame: Frame, scene_estimate: SceneEstimate, scene_graph: SceneGraph, ctx: Context
     ) -> Ros2Sent:
         """Publishes a scene."""
-        return Ros2Sent(messages=tuple(self._publish(frame, scene_estimate, scene_graph, ctx)))
+        return Ros2Sent(messages=tuple(self._outlet.publish(frame, scene_estimate, scene_graph, ctx)))
 
     def on_goal(self, goal: Goal, ctx: Context) -> Ros2Sent | None:
         """Answers who had it taught."""
@@ -165,6 +154,10 @@ class Ros2Demonstration(_Publisher):
         if self._waiting is None or self._waiting[0].name != verdict.goal_name:
             return None
         return self._answer(verdict.success, verdict.reason)
+
+    def close(self) -> None:
+        """Leaves the ROS graph."""
+        self._outlet.close()
 
     def _answer(self, success: bool, message: str) -> Ros2Sent:
         assert self._waiting is not None

@@ -71,7 +71,9 @@ class Node:
 
     def publisher(self, topic: str, type: str, qos: Qos | None = None) -> Publisher:
         """Declares a topic that this node publishes."""
-        return Publisher(self, self.endpoint("MP", topic, type, qos or Qos()))
+        publisher = Publisher(self, self.endpoint("MP", topic, type, qos or Qos()))
+        self.announce(publisher.endpoint)
+        return publisher
 
     def subscribe(self, topic: str, type: str, take: Callable[[Received], None], qos: Qos | None = None) -> Endpoint:
         """Has every message of a topic handed to ``take``; of latched publishers also what they sent before.
@@ -87,16 +89,19 @@ class Node:
                 **_late(endpoint.qos),
             )
         )
+        self.announce(endpoint)
         return endpoint
 
     def endpoint(self, kind: Kind, name: str, type: str, qos: Qos) -> Endpoint:
-        """Makes an endpoint of this node known to the others."""
+        """An endpoint of this node, whose name is made whole; raises Refused for a type that is not known."""
         topic = full_name(name, self.owner.namespace, self.owner.name, self._link.remap)
         hash = self.types.hash(type)
         entity = next(self._entities)
-        endpoint = Endpoint(owner=self.owner, entity=entity, kind=kind, topic=topic, type=type, hash=hash, qos=qos)
+        return Endpoint(owner=self.owner, entity=entity, kind=kind, topic=topic, type=type, hash=hash, qos=qos)
+
+    def announce(self, endpoint: Endpoint) -> None:
+        """Makes an endpoint known to the others, once it takes what they send: who sees it may send."""
         self.keep(self.session.liveliness().declare_token(endpoint.token))
-        return endpoint
 
     def keep(self, declared: Any) -> None:
         """Holds what was declared until the node is closed."""

@@ -15,8 +15,8 @@ from stages.devices.ros2.images import IMAGE
 from stages.devices.ros2.rgbd import INFO, TF
 from stages.devices.ros2.settings import Frames
 from stages.devices.ros2.types import Types
+from stages.geometry.poses import inverse
 from stages.messages import Frame, ObjectPose, Pose, SceneEstimate, SceneGraph
-from stages.perception.poses import inverse
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.text import SURE
 

@@ -66,6 +66,7 @@ def serve(node: Node, name: str, type: str, take: Callable[[Request], None]) -> 
         take(Request(query, message, attachment, node, endpoint))
 
     node.keep(node.session.declare_queryable(endpoint.key, on_query, complete=True))
+    node.announce(endpoint)
 
 
 class Client:
@@ -75,6 +76,7 @@ class Client:
         self._node = node
         self._type = type
         self.endpoint = node.endpoint("SC", name, type, Qos())
+        node.announce(self.endpoint)
         self.name = self.endpoint.topic
         self._numbers = itertools.count(1)
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from stages.geometry.poses import inverse
 from stages.messages.arrays import Pose
-from stages.perception.poses import inverse
 
 
 class NoTransform(Exception):

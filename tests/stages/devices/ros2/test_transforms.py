@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages.devices.ros2.transforms import NoTransform, Transforms
+from stages.geometry.poses import inverse
 from stages.messages import Pose
-from stages.perception.poses import inverse
 from tests.stages.devices.ros2.bags import transform
 
 SECOND = 10**9
