@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class Ros2Views(Protocol):
 
 
 def export_bag(path: Path, target: Path) -> list[str]:
-    """Writes a bag, a new folder; returns lines that say what was written.
+    """Writes a bag, a folder that has its name once all is written; returns lines that say what is in it.
 
     Raises Refused where rosbags is missing, the file is no recording, its views say nothing or the target exists.
     """
@@ -64,21 +65,32 @@ def export_bag(path: Path, target: Path) -> list[str]:
     views = load_views(graph)
     if not isinstance(views, Ros2Views):
         raise Refused(f"{path}: its views {graph.view} say nothing to ROS 2; they have no method ros2")
-    counts: Counter[str] = Counter()
+    if target.exists():
+        raise Refused(f"{target}: cannot be written: File exists")
+    part = target.with_name(f"{target.name}.part")
     try:
-        with rosbag2.Writer(target, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
-            connections: dict[str, Connection] = {}
-            for time_ns, one in _said(recording, graph, views):
-                if one.topic not in connections:
-                    connections[one.topic] = writer.add_connection(
-                        one.topic, one.type, msgdef=one.definition, rihs01=one.hash
-                    )
-                writer.write(connections[one.topic], time_ns, one.data)
-                counts[one.topic] += 1
+        counts = _write(part / target.name, _said(recording, graph, views))
+        (part / target.name).rename(target)
     except (rosbag2.WriterError, OSError) as error:
         raise Refused(f"{target}: cannot be written: {error}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     written = [f"{target}: {count} messages of {topic}" for topic, count in sorted(counts.items())]
     return [f"{path}: {recording.verdict}", *(written or [f"{target}: nothing to say"])]
+
+
+def _write(folder: Path, messages: Iterable[tuple[int, BagMessage]]) -> Counter[str]:
+    """Returns how many there are by topic."""
+    counts: Counter[str] = Counter()
+    connections: dict[str, Connection] = {}
+    with rosbag2.Writer(folder, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        for time_ns, one in messages:
+            if one.topic not in connections:
+                added = writer.add_connection(one.topic, one.type, msgdef=one.definition, rihs01=one.hash)
+                connections[one.topic] = added
+            writer.write(connections[one.topic], time_ns, one.data)
+            counts[one.topic] += 1
+    return counts
 
 
 def _said(recording: Recording, graph: Graph, views: Ros2Views) -> Iterator[tuple[int, BagMessage]]:

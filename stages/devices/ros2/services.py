@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
@@ -20,6 +21,7 @@ from stages.devices.ros2.wire import LATCHED, Attachment, Endpoint, Qos
 
 LONG_SECONDS = 30 * 24 * 3600.0
 """How long Zenoh waits for the result of an action, which may take as long as it takes."""
+_KEPT_GOALS = 16
 STATUSES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 """Of a goal, by number: action_msgs/msg/GoalStatus."""
 CANCEL = "action_msgs/srv/CancelGoal"
@@ -175,7 +177,8 @@ class ActionClient:
         self._send = Client(node, f"{parts}/send_goal", f"{type}_SendGoal")
         self._get = Client(node, f"{parts}/get_result", f"{type}_GetResult")
         self._cancel = Client(node, f"{parts}/cancel_goal", CANCEL)
-        self._feedback: dict[bytes, Callable[[Any], None]] = {}
+        self._feedback: OrderedDict[bytes, Callable[[Any], None]] = OrderedDict()
+        """By goal, also of goals that have ended: their last feedback may come after their result."""
         self._changing = threading.Lock()
         node.subscribe(f"{parts}/feedback", f"{type}_FeedbackMessage", self._on_feedback)
         node.subscribe(f"{parts}/status", "action_msgs/msg/GoalStatusArray", lambda _: None, LATCHED)
@@ -191,21 +194,17 @@ class ActionClient:
         if feedback is not None:
             with self._changing:
                 self._feedback[id] = feedback
+                if len(self._feedback) > _KEPT_GOALS:
+                    self._feedback.popitem(last=False)
         uuid = {"uuid": list(id)}
         goal_message = self._node.types.new(f"{self._type}_Goal", **goal)
         response = self._send.call(seconds=seconds, goal_id=uuid, goal=goal_message)
         if not response.accepted:
             raise Unanswered(f"{self._send.name}: the goal was rejected")
-        result = self._get.start(seconds=LONG_SECONDS, goal_id=uuid)
-        result.add_done_callback(lambda _: self._forget(id))
-        return Goal(id, result, self._cancel)
+        return Goal(id, self._get.start(seconds=LONG_SECONDS, goal_id=uuid), self._cancel)
 
     def _on_feedback(self, received: Received) -> None:
         with self._changing:
             take = self._feedback.get(received.message.goal_id.uuid.tobytes())
         if take is not None:
             take(received.message.feedback)
-
-    def _forget(self, id: bytes) -> None:
-        with self._changing:
-            self._feedback.pop(id, None)

@@ -86,7 +86,7 @@ class ActionServer:
         self.canceled = threading.Event()
         self._goal: Any = None
         parts = f"{name}/_action"
-        self._feedback = node.publisher(f"{parts}/feedback", f"{TRAJECTORY}_FeedbackMessage")
+        self.feedback = node.publisher(f"{parts}/feedback", f"{TRAJECTORY}_FeedbackMessage")
         self._status = node.publisher(f"{parts}/status", "action_msgs/msg/GoalStatusArray", LATCHED)
         serve(node, f"{parts}/send_goal", f"{TRAJECTORY}_SendGoal", self._on_goal)
         serve(node, f"{parts}/get_result", f"{TRAJECTORY}_GetResult", self._on_result)
@@ -112,7 +112,7 @@ class ActionServer:
         for index, point in enumerate([] if self.canceled.is_set() else goal.goal.trajectory.points):
             actual = new("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array(point.positions))
             feedback = new(f"{TRAJECTORY}_Feedback", joint_names=["j1"], actual=actual)
-            self._feedback.put(new(f"{TRAJECTORY}_FeedbackMessage", goal_id=goal.goal_id, feedback=feedback))
+            self.feedback.put(new(f"{TRAJECTORY}_FeedbackMessage", goal_id=goal.goal_id, feedback=feedback))
             self._status.put(new("action_msgs/msg/GoalStatusArray", status_list=[{"status": 2 + index}]))
         result = new(f"{TRAJECTORY}_Result", error_string="given up" if self.canceled.is_set() else "done")
         status = 5 if self.canceled.is_set() else 4

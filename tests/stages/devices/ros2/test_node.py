@@ -72,8 +72,9 @@ def test_a_service_answers_each_call_and_may_take_its_time() -> None:
 def test_an_action_gives_feedback_and_a_result() -> None:
     seen: list[float] = []
     with router() as endpoint, node(endpoint, "arm") as arm, node(endpoint, "client") as client:
-        ActionServer(arm, "/arm/follow")
+        server = ActionServer(arm, "/arm/follow")
         actions = ActionClient(client, "/arm/follow", TRAJECTORY)
+        assert arm.wait_for(server.feedback.endpoint, 5.0) == ""
         goal = actions.send(
             bytes(range(16)),
             seconds=5.0,

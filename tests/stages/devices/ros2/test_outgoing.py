@@ -160,4 +160,4 @@ def test_a_recording_becomes_a_bag_that_others_read_and_that_is_a_camera_again(
 
 def test_what_cannot_be_exported_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(REFERENCE), "--ros2", str(tmp_path)]) == 2
-    assert f"{tmp_path}: cannot be written: {tmp_path} exists already" in capsys.readouterr().err
+    assert f"{tmp_path}: cannot be written: File exists" in capsys.readouterr().err

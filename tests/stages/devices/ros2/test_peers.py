@@ -104,7 +104,7 @@ def test_topics_with_the_sdk(sdk_router: tuple[str, dict[str, Any]]) -> None:
         subscribed = ours.subscribe("/from_them", STRING, heard.append)
         published = ours.publisher("/from_us", STRING)
         assert ours.wait_for(subscribed, 5.0) == "" == ours.wait_for(published.endpoint, 5.0)
-        # The SDK announces a listener before it listens.
+        # A publisher that has just been declared does not know its listeners yet.
         wait_until(lambda: published.put(ours.types.new(STRING, data="to them")) or got)
         talker.publish(data="to us")
         wait_until(lambda: heard)
