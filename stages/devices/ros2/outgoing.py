@@ -37,7 +37,6 @@ class Outgoing:
 
     topic: str
     message: Any
-    latched: bool = False
 
 
 class Scenes:
@@ -83,12 +82,11 @@ class Scenes:
         if graph.frame == "table":
             placed.append(_placed(self._frames.camera, TABLE, estimate.T_camera_table, stamp_ns))
         yield Outgoing("/tf", self._types.new(TF, transforms=placed))
-        yield Outgoing("~/markers", self._markers(estimates, graph, header), latched=True)
+        yield Outgoing("~/markers", self._markers(estimates, graph, header))
         content = {"stamp_ns": stamp_ns, "frame_id": where, **scene_graph_content(graph)}
         content["labels"] = {item.name: item.label for item in graph.objects}
         content["probabilities"] = {item.name: estimates[item.name].probability for item in graph.objects}
-        text = json.dumps(content)
-        yield Outgoing("~/scene_graph", self._types.new(STRING, data=text), latched=True)
+        yield Outgoing("~/scene_graph", self._types.new(STRING, data=json.dumps(content)))
 
     def _image(self, pixels: Any, encoding: str, header: dict[str, Any]) -> Any:
         height, width = pixels.shape[:2]

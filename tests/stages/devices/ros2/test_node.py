@@ -142,6 +142,23 @@ def test_a_server_that_goes_away_ends_the_call() -> None:
             future.result(10.0)
 
 
+def test_a_client_that_goes_away_troubles_nobody() -> None:
+    waiting: list[Request] = []
+    with router() as endpoint, node(endpoint, "server") as server:
+        serve(server, "slow", TRIGGER, waiting.append)
+        with node(endpoint, "client") as client:
+            slow = Client(client, "slow", TRIGGER)
+            assert client.wait_for(slow.endpoint, 5.0) == ""
+            slow.start(seconds=60.0)
+            wait_until(lambda: waiting)
+        waiting[0].answer(server.types.new(f"{TRIGGER}_Response", success=True))
+        with node(endpoint, "next") as client:
+            future = Client(client, "slow", TRIGGER).start(seconds=60.0)
+            wait_until(lambda: len(waiting) == 2)
+            waiting[1].answer(server.types.new(f"{TRIGGER}_Response", message="well"))
+            assert future.result(10.0).message == "well"
+
+
 def test_a_router_that_is_killed_and_comes_back_is_found_again() -> None:
     got: list[str] = []
     port = free_port()
@@ -150,6 +167,9 @@ def test_a_router_that_is_killed_and_comes_back_is_found_again() -> None:
     with node(endpoint, "talker") as talker, node(endpoint, "listener") as listener:
         publisher = talker.publisher("words", STRING)
         subscription = listener.subscribe("words", STRING, lambda one: got.append(one.message.data))
+        response = talker.types.new(f"{TRIGGER}_Response", message="there")
+        serve(talker, "there", TRIGGER, lambda request: request.answer(response))
+        client = Client(listener, "there", TRIGGER)
         assert listener.wait_for(subscription, 5.0) == ""
         first.close()
         wait_until(lambda: "nobody publishes it" in listener.obstacle(subscription))
@@ -158,6 +178,7 @@ def test_a_router_that_is_killed_and_comes_back_is_found_again() -> None:
         assert talker.wait_for(publisher.endpoint, 30.0) == ""
         publisher.put(talker.types.new(STRING, data="again"))
         wait_until(lambda: got)
+        assert client.call(seconds=10.0).message == "there"
     second.close()
     assert got == ["again"]
 
