@@ -18,7 +18,7 @@ from runner.contract import Refused
 from runner.graph.placement import Credentials
 from runner.hosts.keys import credentials
 from runner.transport.security import tls
-from stages.devices.ros2.settings import Link
+from stages.devices.ros2.settings import Link, refuse_odd_name
 from stages.devices.ros2.types import Types, matching
 from stages.devices.ros2.wire import COUNTERPART, TOKENS, Attachment, Endpoint, Kind, Owner, Qos, full_name
 
@@ -93,8 +93,9 @@ class Node:
         return endpoint
 
     def endpoint(self, kind: Kind, name: str, type: str, qos: Qos) -> Endpoint:
-        """An endpoint of this node, whose name is made whole; raises Refused for a type that is not known."""
+        """An endpoint of this node, its name made whole; raises Refused for no name, or a type that is not known."""
         topic = full_name(name, self.owner.namespace, self.owner.name, self._link.remap)
+        refuse_odd_name(name, topic)
         hash = self.types.hash(type)
         entity = next(self._entities)
         return Endpoint(owner=self.owner, entity=entity, kind=kind, topic=topic, type=type, hash=hash, qos=qos)
@@ -223,9 +224,9 @@ def _open(link: Link) -> zenoh.Session:
     if link.keys is not None:
         settings |= {"transport/link/protocols": ["tls"], "transport/link/tls": tls(_credentials(link.keys))}
     config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
     try:
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
         reason = str(error).partition(" at /")[0]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+from runner.contract import Refused
+
 Distribution = Literal["jazzy", "kilted", "lyrical"]
 DISTRIBUTIONS: tuple[Distribution, ...] = get_args(Distribution)
+LAST_DOMAIN = 232
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +31,14 @@ class Link:
     """Other names for topics and services."""
     distribution: Distribution = "jazzy"
     """Of the other nodes: jazzy, kilted or lyrical."""
+
+    def __post_init__(self) -> None:
+        """Refuses what is no name and no number of a domain in ROS 2."""
+        if not 0 <= self.domain <= LAST_DOMAIN:
+            raise Refused(f"link.domain = {self.domain}: must lie between 0 and {LAST_DOMAIN}")
+        refuse_odd_name("link.node", f"/{self.node}")
+        if self.namespace.strip("/"):
+            refuse_odd_name("link.namespace", f"/{self.namespace.strip('/')}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,3 +85,9 @@ class Frames:
     """What poses are given in, where it is known how the camera stands to the robot."""
     camera: str = "camera_color_optical_frame"
     """Of the colour camera; else poses are in the table's frame, which hangs on this one."""
+
+
+def refuse_odd_name(place: str, name: str) -> None:
+    """Raises Refused where a whole name is none of ROS 2 (https://design.ros2.org/articles/topic_and_service_names.html)."""
+    if not _NAME.fullmatch(name):
+        raise Refused(f"{place}: {name} is no name in ROS 2; parts have letters, digits and _, and begin with no digit")

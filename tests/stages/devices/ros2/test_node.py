@@ -1,6 +1,7 @@
 """Two of our nodes at a router: topics, services, actions, and what goes wrong."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -187,6 +188,30 @@ def test_no_router_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.devices.ros2.node.CALL_SECONDS", 0.2)
     with pytest.raises(Refused, match=r"no ROS 2 router at tcp/127.0.0.1:1: .*ros2 run rmw_zenoh_cpp rmw_zenohd"):
         Node(Link(router="tcp/127.0.0.1:1"), print)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"domain": 233}, "link.domain = 233: must lie between 0 and 232"),
+        ({"node": "my node"}, "link.node: /my node is no name in ROS 2"),
+        ({"namespace": "/lab/1"}, "link.namespace: /lab/1 is no name in ROS 2"),
+        ({"router": "localhost"}, "no ROS 2 router at localhost: "),
+        ({"router": "tls/127.0.0.1:1", "keys": Path("nowhere/robot")}, "nowhere/robot/cert.pem: "),
+    ],
+)
+def test_odd_settings_are_one_line(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(Refused, match=says) as refused:
+        Node(Link(**settings), print)
+    assert "\n" not in str(refused.value)
+
+
+def test_odd_topics_are_one_line() -> None:
+    with router() as endpoint, node(endpoint, "one", remap={"words": "/a b"}) as one:
+        with pytest.raises(Refused, match="words: /a b is no name in ROS 2"):
+            one.publisher("words", STRING)
+        with pytest.raises(Refused, match=r"my_msgs/msg/Mine: no such ROS 2 interface here"):
+            one.publisher("mine", "my_msgs/msg/Mine")
 
 
 def test_keys_let_a_node_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
