@@ -2,6 +2,7 @@
 
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,24 @@ def test_a_stage_answers_message_by_message():
         Double(value=2),
         Double(value=8),
     ]
+
+
+class Radio(Stage):
+    """Hears something now and then, and doubles what it is told meanwhile."""
+
+    device = True
+
+    def source(self, ctx: Context) -> Iterator[Number | None]:
+        for heard in (None, 1, None, None, 2, None):
+            time.sleep(0.01)
+            yield None if heard is None else Number(value=heard)
+
+    def on_double(self, double: Double) -> Number:
+        return Number(value=double.value)
+
+
+def test_a_source_may_have_nothing_yet():
+    assert run_stage(Radio()) == [Number(value=1), Number(value=2)]
 
 
 def test_a_source_runs_to_its_end_or_its_limit():
