@@ -1,6 +1,7 @@
 """What went wrong, object by object: `python -m benchmarks.failures DATASET CSV OUT.png`.
 
-A row for each object that is not within 2 cm and 15 degrees: what was observed, the estimate and the truth.
+A row for each object that is not within 2 cm and 15 degrees, without any symmetry where the data set knows how the
+label faces: what was observed, the estimate and the truth.
 """
 
 from __future__ import annotations
@@ -111,6 +112,8 @@ class Sheet:
         """A renderer of the image's size; sizes hardly ever change within a data set."""
         height, width = image.depth.shape
         if self._renderer is None or (self._renderer.width, self._renderer.height) != (width, height):
+            if self._renderer is not None:
+                self._renderer.close()
             self._renderer = Renderer(width, height)
         return self._renderer
 

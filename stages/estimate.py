@@ -49,7 +49,8 @@ class EstimatedScene:
     @property
     def objects(self) -> tuple[ObjectPose, ...]:
         """Each with ``name``, ``label``, ``T_camera_object``, ``probability`` that this pose is right within 2 cm and
-        15 degrees, its spread, and ``alternatives`` with their probabilities."""
+        15 degrees modulo symmetries, its spread, ``alternatives`` with their probabilities, and ``facing``: how likely
+        its label faces as the pose says."""
         return self.estimate.objects
 
     @property

@@ -44,6 +44,11 @@ class Refiner(Stage):
         self.config = config
         self._refiner: SceneRefiner | None = None
         if config.form == "default":
+            # torch takes a second to load; whoever only reads a graph does without.
+            import torch
+
+            torch.set_num_threads(1)
+            torch.set_deterministic_debug_mode("error")
             settings = RefinementSettings.of(FilterSettings(dof=config.dof).without(*config.without))
             catalogue = Catalogue.shared(config.catalogue)
             self._refiner = SceneRefiner(catalogue, settings)
@@ -69,5 +74,5 @@ class Refiner(Stage):
 def _object(item: ObjectPose, refined: RefinedObject) -> ObjectPose:
     T = refined.T_camera_object
     return msgspec.structs.replace(
-        item, T_camera_object=pose(T[:, :3], T[:, 3]), cost=refined.cost, visible=refined.visible
+        item, T_camera_object=pose(T[:, :3], T[:, 3]), cost=refined.cost, visible=refined.visible, facing=refined.facing
     )

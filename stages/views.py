@@ -329,6 +329,7 @@ def _look_row(item: ObjectPose) -> str:
     sure = "" if item.probability is None else f"{item.probability:.2f}"
     notes = ["**contradicted**"] if item.contradicted else []
     notes += [f"or another pose ({other.probability:.2f})" for other in item.alternatives[:1]]
+    notes += ["no telling which side it shows"] if item.facing is not None and item.facing < UNSURE else []
     cells = (item.name, sure, _spread(item), f"{1e3 * item.cost:.1f} mm", f"{item.visible:.0%}", ", ".join(notes))
     return f"| {' | '.join(cells)} |"
 

@@ -36,6 +36,8 @@ class Truth:
     """Share of its silhouette that can be seen; 1 where the data set does not say."""
     box: Floats | None = None
     """Of what can be seen: x0, y0, x1, y1 in pixels; None where the data set does not say."""
+    label_known: bool = False
+    """Whether the pose is also true without any symmetry: which way the label faces."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,10 @@ def _scene_truth(file: Path) -> Iterator[Truth]:
         for item, info in zip(items, infos.get(image, [{}] * len(items)), strict=True):
             T = pose(np.array(item["cam_R_m2c"], float).reshape(3, 3), np.array(item["cam_t_m2c"], float) / 1000)
             visible = float(info.get("visib_fract", 1.0))
-            yield Truth((int(file.parent.name), int(image)), int(item["obj_id"]), T, visible, _box(info))
+            yield Truth(
+                (int(file.parent.name), int(image)), int(item["obj_id"]), T, visible, _box(info),
+                label_known=bool(item.get("label_known", False)),
+            )  # fmt: skip
 
 
 def _box(info: dict[str, Any]) -> Floats | None:

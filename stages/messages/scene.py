@@ -44,6 +44,9 @@ class ObjectPose(Struct, frozen=True, kw_only=True):
     """Share of the visible silhouette where the reading lies clearly behind the surface, 0 to 1."""
     contradicted: bool = False
     """True where the image shows that the object cannot be there as estimated."""
+    facing: float | None = None
+    """How likely an object with symmetries also faces as the pose says, its label to that side, if the pose is right
+    but for them; small where the image does not show it. None where it has no symmetry, or nobody looked."""
 
 
 class UnknownRegion(Struct, frozen=True, kw_only=True):

@@ -59,6 +59,7 @@ TOLERANCES = {
     "ObjectPose.spread_metres": POSE,
     "ObjectPose.spread_radians": Tolerance(0.01),
     "ObjectPose.looked_through": SHARE,
+    "ObjectPose.facing": PROBABILITY,
     "Alternative.T_camera_object": POSE,
     "Alternative.probability": PROBABILITY,
     "UnknownRegion.box": Tolerance(2.0),

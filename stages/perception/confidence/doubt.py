@@ -49,8 +49,6 @@ _DETAIL = 60.0
 _FORM = CostForm().truncated(0.015)
 _PIXEL = 0.003
 """Metres by which a reading that speaks against a pose is off, for the unit of evidence."""
-_COLOUR = 0.5
-"""CIELAB units of mean distance that count as one nat."""
 _TURNS = np.deg2rad(np.arange(10.0, 360.0, 10.0))
 _SHIFTS = np.array([-0.05, -0.03, -0.015, 0.015, 0.03, 0.05])
 _REFINED = 24
@@ -130,8 +128,8 @@ class Rival:
 
     T_camera_object: Floats
     """3 x 4."""
-    colour: float
-    """By how much its colours are farther from the image than the estimate's, CIELAB units; 0 where colour is mute."""
+    nats: float
+    """Log-odds of the estimate against it."""
 
 
 @dataclass(frozen=True)
@@ -255,11 +253,9 @@ def hypothesis_probabilities(log_weights: Floats, nat: float) -> Floats:
 
 def judged(item: ObjectPose, refined: RefinedObject) -> Judged:
     """An object as the refiner leaves it, with the poses it compared by colour."""
-    mine, *others = refined.considered or (None,)
-    own = None if mine is None else mine.colour
-    rivals = [(o.T_camera_object, 0.0 if own is None or o.colour is None else o.colour - own) for o in others if o]
+    rivals = tuple(Rival(each.T_camera_object, each.nats) for each in refined.considered)
     return Judged(
-        refined.label, refined.T_camera_object, item.confidence, tuple(Rival(*rival) for rival in rivals), item.box,
+        refined.label, refined.T_camera_object, item.confidence, rivals, item.box,
         sunk=refined.sunk, penetration=refined.penetration,
     )  # fmt: skip
 
@@ -386,7 +382,9 @@ class _Look:
         unit = _PIXEL * constants.pose_scale
         own = float(self._likelihood.costs(self._pose[None])[0])
         probes = self._probes(item.rivals)
-        nats = (self._likelihood.costs(probes) - own) / unit + self._colour(probes, item.rivals)
+        nats = (self._likelihood.costs(probes) - own) / unit
+        for rival in item.rivals:
+            nats[self._is_same(probes, rival.T_camera_object)] = rival.nats
         nats = np.clip(nats, -_CAP, 50.0)
         angles, metres = self._apart(probes)
         away = self._is_away(probes)
@@ -414,14 +412,6 @@ class _Look:
         kept = cells[: min(likely, _KEPT)]
         return evidence, Others(probes[away][kept], np.minimum(weights[: len(kept)], 1.0))
 
-    def _colour(self, probes: Floats, rivals: Sequence[Rival]) -> Floats:
-        """What colour says against each probe, nats: what it says against the rival that is nearly the same."""
-        nats = np.zeros(len(probes))
-        for rival in rivals:
-            angles, metres = self._between(probes, rival.T_camera_object)
-            nats[(angles < RIGHT_RADIANS) & (metres < RIGHT_METRES)] = rival.colour / _COLOUR
-        return nats
-
     def _probes(self, rivals: Sequence[Rival]) -> Floats:
         """Turns about the object's axes (the plane's normal with three degrees of freedom), flips, shifts and
         rivals; the better ones that are not nearly the same refined too."""
@@ -439,8 +429,11 @@ class _Look:
         return np.concatenate([probes, refined])
 
     def _is_away(self, poses: Floats) -> NDArray[np.bool_]:
-        angles, metres = self._apart(poses)
-        return (angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)
+        return ~self._is_same(poses, self._pose)
+
+    def _is_same(self, poses: Floats, pose: Floats) -> NDArray[np.bool_]:
+        angles, metres = self._between(poses, pose)
+        return (angles <= RIGHT_RADIANS) & (metres <= RIGHT_METRES)
 
     def _spread(self, own: float, unit: float) -> tuple[float, float]:
         """Standard deviations of position and angle under the tempered likelihood, by importance sampling.
@@ -466,8 +459,7 @@ class _Look:
         order = likely[distinct_best(poses[likely], nats[likely], 64, metres=RIGHT_METRES, radians=RIGHT_RADIANS)]
         kept: list[int] = []
         for i in order.tolist():
-            angles, metres = self._between(poses[kept], poses[i])
-            if bool(((angles > RIGHT_RADIANS) | (metres > RIGHT_METRES)).all()):
+            if not self._is_same(poses[kept], poses[i]).any():
                 kept.append(i)
         return np.asarray(kept, np.intp)
 

@@ -23,6 +23,8 @@ GRID = SIDE // 16
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
            (1, 3, 1, 6, 320))  # fmt: skip
 """Blocks, kernel, stride of the first block, expansion, channels."""
+_EARLY = (2, 4, 7)
+"""The blocks whose features are mostly colours, edges and patterns: strides 4, 8 and 16."""
 _MIDDLE = 10
 """The block whose features still say where something is: the last of stride 16."""
 _BATCH = 16
@@ -66,13 +68,13 @@ class _Convolution(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, *, groups: int = 1) -> None:
         super().__init__()
-        self.convolution = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups)
         total = kernel - stride if stride > 1 else kernel - 1
-        self._padding = (total // 2, total - total // 2) * 2
+        self.convolution = nn.Conv2d(inputs, outputs, kernel, stride, total // 2, groups=groups)
+        self._odd = total % 2
 
     def forward(self, x: Tensor) -> Tensor:
         """B x C x h x w to B x C' x h / stride x w / stride."""
-        return self.convolution(functional.pad(x, self._padding))
+        return self.convolution(functional.pad(x, (0, 1, 0, 1)) if self._odd else x)
 
 
 class Backbone(nn.Module):
@@ -109,15 +111,35 @@ class Backbone(nn.Module):
         parts = [self._batch(crops[i : i + _BATCH], masks[i : i + _BATCH]) for i in starts]
         return Features(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
+    def early(self, images: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        """What the early layers make of N x h x w x 3 (sRGB, 0 to 255): N x h/s x w/s x C at strides s = 4, 8, 16."""
+        parts = [self._early(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH)]
+        return tuple(np.concatenate(layers) for layers in zip(*parts, strict=True))
+
+    @torch.inference_mode()
+    def _early(self, images: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        x = functional.relu6(self.stem(_normalised(images)))
+        found: list[NDArray[np.float32]] = []
+        for index, block in enumerate(self.blocks[: _EARLY[-1] + 1]):
+            x = block(x)
+            if index in _EARLY:
+                found.append(x.permute(0, 2, 3, 1).contiguous().numpy())
+        return tuple(found)
+
     @torch.inference_mode()
     def _batch(self, crops: NDArray[np.uint8], masks: NDArray[np.bool_]) -> tuple[NDArray[np.float32], ...]:
         mask = torch.from_numpy(np.ascontiguousarray(masks, np.float32))[:, None]
-        image = torch.from_numpy(np.ascontiguousarray(crops)).permute(0, 3, 1, 2).float().sub(127.0).div(128.0) * mask
-        middle, last = self(image.contiguous(memory_format=torch.channels_last))
+        middle, last = self(_normalised(crops) * mask)
         fine, coarse = functional.avg_pool2d(mask, 16), functional.avg_pool2d(mask, 32)
         grid = middle.flatten(2).transpose(1, 2).contiguous()
         covered = fine.flatten(1) > 0.5
         return _mean(middle, fine).numpy(), _mean(last, coarse).numpy(), grid.numpy(), covered.numpy()
+
+
+def _normalised(images: NDArray[np.floating] | NDArray[np.uint8]) -> Tensor:
+    """N x h x w x 3 (sRGB, 0 to 255) as the network takes them: N x 3 x h x w, about -1 to 1."""
+    pixels = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2)
+    return pixels.float().sub(127.0).div(128.0).contiguous(memory_format=torch.channels_last)
 
 
 def _mean(features: Tensor, weights: Tensor) -> Tensor:

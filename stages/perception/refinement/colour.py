@@ -1,263 +1,143 @@
-"""Tells apart, by colour, poses that look alike in depth (docs/perception/colour.md).
+"""Which of several poses a photograph shows, by what is painted on the object (docs/perception/colour.md).
 
-Such poses show the same surface at every pixel, painted differently. Both paints are compared with the image in CIELAB
-after the light has been fitted: it scales lightness and chroma, and it changes lightness with the surface's normal,
-which the poses share. What remains is a robust distance per pixel. Another pose than depth's favourite wins only where
-its mean distance is smaller by several standard errors, taken over patches of the image.
+The object is drawn into the photograph at every pose, all under one light. What the early layers of an ImageNet network
+make of it is compared with what they make of the photograph itself, at the best common shift: colour is registered to
+depth within a few pixels at best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from stages.geometry.arrays import Floats, distinct_rows
+from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.scene.catalogue import Mesh
+from stages.geometry.arrays import Floats
 
-_SPACING = 0.002
-"""Metres between samples of a painted surface."""
-_PIXELS = 900
-"""Pixels compared at most, and how many choose among a pose's exact symmetries."""
-_SCOUTS = 150
-_TILE = 4
-"""Side of a patch in compared pixels: neighbours err together."""
-_LEAST_TILES = 6
-_SURE = 2.0
-"""Standard errors by which a pose's colours must fit better than the favourite's."""
-_LEAST = 0.3
-"""Mean distance, CIELAB units, below which no difference counts."""
-_SHARE = 0.1
-"""Share of the better distance by which it must be smaller: what no paint explains also errs in favour of one."""
-_XYZ_FROM_RGB = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
-_WHITE = _XYZ_FROM_RGB.sum(1)
-"""D65."""
-_Prior = tuple[tuple[float, float], ...]
-_LIGHTNESS: _Prior = ((1.0, 0.5), (0.0, 30.0), (0.0, 12.0), (0.0, 12.0), (0.0, 12.0))
-"""Mean and deviation between images: the gain of L*, its offset, its slopes with the three parts of the normal."""
-_CHROMA: _Prior = ((1.0, 0.5), (0.0, 10.0), (0.0, 10.0))
-"""The gain of a* and b*, and their offsets."""
-_NOISE = 8.0
-_EVIDENCE = 10.0
-"""The priors weigh as much as so many pixels of that noise."""
-_LIGHTNESS_WEIGHT = 0.6
-"""Of squared differences in L*, which shadows change most."""
-_HUBER = 10.0
-"""Distance from which a pixel (a highlight, a shadow) counts in proportion rather than squared."""
-_FITS = 4
+Mask = NDArray[np.bool_]
+
+_SIDE = 128
+"""Pixels along the square to which the object and what is around it are scaled."""
+_REACH = 9
+"""Pixels of the photograph by which colour may lie beside depth."""
+_MARGIN = 4
+"""Pixels around the object besides."""
+_LEAST = 60
+"""Pixels of the photograph below which nothing can be read."""
+_GAIN = 2.0
+"""Contrast of the photograph relative to the paint's, at most: what is more is no paint."""
+_LIKE = 25.0
+"""Grey levels by which paints must differ to be told apart: by more than light, print and camera change one paint."""
+_NATS = 30.0
+"""For a unit of mean cosine, summed over the layers."""
+
+
+def load() -> None:
+    """Reads the network, so that the first photograph does not wait for it."""
+    # torch takes a second to load; whoever only reads a graph does without.
+    from stages.perception.detection.backbone import Backbone
+
+    Backbone.pretrained()
+
+
+def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, paint: Paint) -> Floats:
+    """How much better the photograph suits one pose than another: nats up to a constant, P; all 0 where it cannot say.
+
+    ``rgb`` is H x W x 3 (sRGB), ``shown`` H x W: where the object can be seen at every pose; ``poses`` are P x 3 x 4
+    rows of T_camera_object.
+    """
+    if len(poses) < 2 or shown.sum() < _LEAST:
+        return np.zeros(len(poses))
+    crop = _Crop.around(shown, view)
+    drawn, covered = zip(*(paint.drawn(T, crop.view) for T in poses), strict=True)
+    everywhere = np.logical_and.reduce([crop.cut(shown.astype(np.float32)) > 0.99, *covered])
+    # Pixels at the outline show what is behind the object as well.
+    inner = cv2.erode(everywhere.astype(np.uint8), np.ones((2 * int(2 * crop.scale) + 3,) * 2, np.uint8)) > 0
+    if inner.sum() < _LEAST * crop.scale**2:
+        return np.zeros(len(poses))
+    photograph = crop.cut(rgb.astype(np.float32))
+    lit = _lit(np.stack(drawn), photograph, inner)
+    pasted = np.where(everywhere[..., None], lit, photograph)
+    return _NATS * _told_apart(lit[:, inner]) * _likeness(photograph, pasted, inner, _REACH * crop.scale)
 
 
 @dataclass(frozen=True)
-class Paint:
-    """The colours of a mesh's surface."""
+class _Crop:
+    """A square part of an image, scaled to _SIDE pixels."""
 
-    tree: KDTree
-    lab: Floats
-    """N x 3, CIELAB of the samples that the tree holds."""
+    left: int
+    top: int
+    side: int
+    view: View
 
     @staticmethod
-    def of(mesh: Mesh) -> Paint:
-        """Samples every triangle about every 2 mm; colours are interpolated between its corners."""
-        points, colors = _samples(mesh)
-        first, _ = distinct_rows(np.round(points / (0.5 * _SPACING)).astype(np.int64))
-        return Paint(KDTree(points[first]), cielab(colors[first]))
+    def around(mask: Mask, view: View) -> _Crop:
+        """What surrounds a mask that is not empty."""
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
+        side = int((high - low).max()) + 1 + 2 * (_REACH + _MARGIN)
+        left, top = ((low + high + 1 - side) // 2).tolist()
+        scale = _SIDE / side
+        cx, cy = (view.cx - left + 0.5) * scale - 0.5, (view.cy - top + 0.5) * scale - 0.5
+        return _Crop(left, top, side, View(view.fx * scale, view.fy * scale, cx, cy, _SIDE, _SIDE))
 
-    def at(self, points: Floats) -> Floats:
-        """CIELAB of the surface nearest to each point of the object frame, ... x 3 metres -> ... x 3."""
-        _, nearest = self.tree.query(points)
-        return self.lab[nearest]
+    @property
+    def scale(self) -> float:
+        """Pixels of the square for one of the image."""
+        return _SIDE / self.side
 
-
-@dataclass(frozen=True)
-class Contender:
-    """A pose that depth allows."""
-
-    T_camera_object: Floats
-    """3 x 4."""
-    layer: Float32s
-    """H x W inverse depth of the object alone at that pose."""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What colour says of some contenders."""
-
-    winner: int
-    distances: Floats
-    """Mean distance of each contender's colours from the image, CIELAB units."""
+    def cut(self, image: Float32s) -> Float32s:
+        """That part of an image (H x W or H x W x 3), whose edges go on beyond it."""
+        rows, columns = (np.arange(first, first + self.side) for first in (self.top, self.left))
+        part = image[np.clip(rows, 0, image.shape[0] - 1)[:, None], np.clip(columns, 0, image.shape[1] - 1)]
+        way = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC
+        return np.asarray(cv2.resize(part, (_SIDE, _SIDE), interpolation=way), np.float32)
 
 
-def judge(
-    rgb: NDArray[np.uint8],
-    view: View,
-    visible: NDArray[np.bool_],
-    contenders: Sequence[Contender],
-    *,
-    paint: Paint,
-    symmetries: Floats,
-) -> Verdict | None:
-    """Which contender's colours the image shows; None where too little of the object is seen.
+def _lit(paints: Float32s, photograph: Float32s, inner: Mask) -> Float32s:
+    """Paints (P x S x S x 3) in the photograph's light: mean of each channel, and contrast.
 
-    ``rgb`` is H x W x 3 (sRGB), ``visible`` H x W: where all contenders can be seen. Each is compared at the best of
-    its exact ``symmetries`` (S x 4 x 4), of which depth knows nothing. The first, depth's favourite, stays where colour
-    is not sure.
+    One light for all poses: were each free to choose its own, a black lid in bright light would be a white one.
     """
-    rows, columns, stride = _compared(visible)
-    if len(np.unique(_tiles(rows, columns, stride))) < _LEAST_TILES:
-        return None
-    image = smoothed_lab(rgb, stride)[rows, columns]
-    normals = surface_normals(contenders[0].layer, view)[rows, columns]
-    rays = view.rays()[rows, columns]
-    painted = np.stack([
-        _best_painted(paint, symmetries, _object_points(each, rays, rows, columns), image, normals)
-        for each in contenders
-    ])  # fmt: skip
-    fits = distances(image, painted, normals)
-    means = fits.mean(-1)
-    best = int(np.argmin(means))
-    sure = _is_sure(fits[0] - fits[best], _tiles(rows, columns, stride)) and means[0] > (1 + _SHARE) * means[best]
-    return Verdict(best if sure else 0, means)
+    seen, paint = photograph[inner], paints[:, inner]
+    gain = min(float(seen.std()) / max(float(paint.std()), 1.0), _GAIN)
+    return (paints - paint.mean((0, 1))) * gain + seen.mean(0)
 
 
-def cielab(rgb: NDArray[Any]) -> Floats:
-    """CIELAB (CIE 15:2004, D65) of sRGB (IEC 61966-2-1, 0 to 255), ... x 3."""
-    encoded = np.asarray(rgb, np.float64) / 255.0
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    t = (linear[..., None, :] * _XYZ_FROM_RGB).sum(-1) / _WHITE
-    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t * (29 / 6) ** 2 / 3 + 4 / 29)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1)
+def _told_apart(colors: Float32s) -> float:
+    """How much of a difference between poses is paint, 0 to 1; of colours P x K x 3.
 
-
-def smoothed_lab(rgb: NDArray[np.uint8], pixels: int) -> Floats:
-    """CIELAB of an image averaged over squares of ``pixels`` pixels, at least two, H x W x 3."""
-    side = max(2, pixels)
-    return cielab(cv2.blur(rgb.astype(np.float32), (side, side)))
-
-
-def surface_normals(layer: Float32s, view: View) -> Floats:
-    """Unit normals of a rendered surface, camera frame, H x W x 3; inverse depth is linear on a plane."""
-    down, right = np.gradient(layer.astype(np.float64))
-    rays = view.rays()
-    x, y = right * view.fx, down * view.fy
-    normals = np.stack([x, y, layer - rays[..., 0] * x - rays[..., 1] * y], -1)
-    return normals / np.maximum(np.sqrt((normals**2).sum(-1, keepdims=True)), 1e-12)
-
-
-def distances(observed: Floats, painted: Floats, normals: Floats) -> Floats:
-    """Robust distance of each pixel's colour from each paint under the light that suits that paint best, C x P.
-
-    ``observed`` is P x 3 CIELAB, ``painted`` C x P x 3, ``normals`` P x 3 unit vectors. The light is found by
-    iteratively reweighted least squares with the pseudo-Huber loss.
+    What looks alike at all poses, for it has one colour, differs by noise and by shading.
     """
-    one = np.ones((*painted.shape[:2], 1))
-    zero = np.zeros_like(one)
-    shades = np.broadcast_to(normals, painted.shape)
-    L = np.concatenate([painted[..., :1], one, shades], -1)
-    a = np.concatenate([painted[..., 1:2], one, zero], -1)
-    b = np.concatenate([painted[..., 2:], zero, one], -1)
-    squared = np.zeros(painted.shape[:2])
-    for _ in range(_FITS):
-        weights = 1 / np.sqrt(1 + squared / _HUBER**2)
-        (miss_L,) = _misses([(L, observed[:, 0])], weights, _LIGHTNESS)
-        miss_a, miss_b = _misses([(a, observed[:, 1]), (b, observed[:, 2])], weights, _CHROMA)
-        squared = _LIGHTNESS_WEIGHT * miss_L**2 + miss_a**2 + miss_b**2
-    return _HUBER * (np.sqrt(1 + squared / _HUBER**2) - 1)
+    spread = float(((colors - colors.mean(0)) ** 2).sum(-1).mean())
+    return spread / (spread + _LIKE**2)
 
 
-def _misses(channels: Sequence[tuple[Floats, Floats]], weights: Floats, prior: _Prior) -> list[Floats]:
-    """What a linear model leaves of each channel, C x P; all channels are fitted at once, by ridge regression."""
-    mean, deviation = np.array(prior).T
-    ridge = (_NOISE / deviation) ** 2 / _EVIDENCE
-    share = weights / weights.sum(-1, keepdims=True)
-    A = np.tile(np.diag(ridge), (len(weights), 1, 1))
-    rhs = np.tile(ridge * mean, (len(weights), 1))
-    for X, y in channels:
-        for j in range(len(mean)):
-            column = share * X[..., j]
-            rhs[:, j] += (column * y).sum(-1)
-            for k in range(len(mean)):
-                A[:, j, k] += (column * X[..., k]).sum(-1)
-    beta = np.linalg.solve(A, rhs[..., None])[..., 0]
-    return [y - (X * beta[:, None, :]).sum(-1) for X, y in channels]
+def _likeness(photograph: Float32s, pasted: Float32s, inner: Mask, reach: float) -> Floats:
+    """Mean cosine between features of S x S x 3 and of each of P x S x S x 3, summed over the layers, P.
+
+    Features are standardised over all images; ``reach`` is the largest shift, pixels of the square.
+    """
+    from stages.perception.detection.backbone import Backbone
+
+    images = np.clip(np.concatenate([photograph[None], pasted]), 0, 255)
+    return np.sum([_layer_likeness(layer, inner, reach) for layer in Backbone.pretrained().early(images)], 0)
 
 
-def _compared(visible: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """Rows and columns of the compared pixels, away from the outline, and the step between them."""
-    inner = cv2.erode(visible.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    stride = max(1, int(np.sqrt(inner.sum() / _PIXELS)))
-    rows, columns = np.nonzero(inner[::stride, ::stride])
-    return rows * stride, columns * stride, stride
-
-
-def _tiles(rows: NDArray[np.intp], columns: NDArray[np.intp], stride: int) -> NDArray[np.intp]:
-    """The patch that each compared pixel belongs to."""
-    side = _TILE * stride
-    return (rows // side) * 100000 + columns // side
-
-
-def _object_points(each: Contender, rays: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
-    """Where the contender's surface is at the compared pixels, object frame, P x 3."""
-    R, t = each.T_camera_object[:, :3], each.T_camera_object[:, 3]
-    points = rays / each.layer[rows, columns].astype(np.float64)[:, None] - t
-    return (points[:, :, None] * R).sum(1)
-
-
-def _best_painted(paint: Paint, symmetries: Floats, points: Floats, image: Floats, normals: Floats) -> Floats:
-    """The colours of an object's points, turned by the symmetry that suits a sample of the image best, P x 3."""
-    scouts = np.s_[:: max(1, len(points) // _SCOUTS)]
-    turned = _turned_back(symmetries, points[scouts])
-    fits = distances(image[scouts], paint.at(turned), normals[scouts]).mean(-1)
-    best = symmetries[[int(np.argmin(fits))]]
-    return paint.at(_turned_back(best, points))[0]
-
-
-def _turned_back(symmetries: Floats, points: Floats) -> Floats:
-    """The points of the object frame that the symmetries bring to ``points``, S x P x 3."""
-    moved = points - symmetries[:, None, :3, 3]
-    return (moved[..., None] * symmetries[:, None, :3, :3]).sum(-2)
-
-
-def _is_sure(gains: Floats, tiles: NDArray[np.intp]) -> bool:
-    """Whether the mean of ``gains`` (P) exceeds its standard error over the patches several times."""
-    _, patch, counts = np.unique(tiles, return_inverse=True, return_counts=True)
-    mean = gains.mean()
-    deviations = np.bincount(patch, gains) - counts * mean
-    error = np.sqrt((deviations**2).sum() * len(counts) / (len(counts) - 1)) / len(gains)
-    return bool(mean > max(_SURE * error, _LEAST))
-
-
-def _samples(mesh: Mesh) -> tuple[Floats, Floats]:
-    """Points on all triangles and their interpolated colours, N x 3 each."""
-    corners = mesh.vertices[mesh.faces]
-    colors = mesh.colors[mesh.faces].astype(np.float64)
-    longest = np.sqrt(((corners - np.roll(corners, 1, 1)) ** 2).sum(-1)).max(1)
-    parts = np.clip(np.ceil(longest / _SPACING), 1, 24).astype(int)
-    points: list[Floats] = []
-    paints: list[Floats] = []
-    for n in np.unique(parts):
-        weights, chosen = _barycentric(int(n)), parts == n
-        points.append(_interpolated(weights, corners[chosen]))
-        paints.append(_interpolated(weights, colors[chosen]))
-    return np.concatenate(points), np.concatenate(paints)
-
-
-def _interpolated(weights: Floats, corners: Floats) -> Floats:
-    """Means of three corners' values (F x 3 x 3) with each of the weights (N x 3), F N x 3."""
-    first, second, third = (weights[:, k, None] * corners[:, None, k] for k in range(3))
-    return (first + second + third).reshape(-1, 3)
-
-
-def _barycentric(n: int) -> Floats:
-    """Weights of the centres of the small triangles that point upwards in one divided n times, N x 3."""
-    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    inside = i + j < n
-    u, v = (i[inside] + 1 / 3) / n, (j[inside] + 1 / 3) / n
-    return np.stack([u, v, 1 - u - v], -1)
+def _layer_likeness(layer: Float32s, inner: Mask, reach: float) -> Floats:
+    """The same of one layer's features, (1 + P) x s x s x C."""
+    size = layer.shape[1]
+    share = cv2.resize(inner.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
+    cells = share > min(0.6, 0.9 * float(share.max()))
+    mean, deviation = layer[:, cells].mean((0, 1)), layer[:, cells].std((0, 1))
+    features = (layer - mean) / (deviation + 1e-3)
+    features /= np.sqrt((features**2).sum(-1, keepdims=True))
+    most = max(1, round(reach * size / _SIDE))
+    seen = np.pad(features[0], ((most, most), (most, most), (0, 0)), mode="edge")
+    shifts = [(y, x) for y in range(2 * most + 1) for x in range(2 * most + 1)]
+    drawn = features[1:, cells]
+    fits = [(drawn * seen[y : y + size, x : x + size][cells]).sum(-1).mean(-1) for y, x in shifts]
+    return np.max(fits, 0).astype(np.float64)

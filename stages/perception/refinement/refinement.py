@@ -2,7 +2,7 @@
 
 The filters of the hypotheses look at coarse windows and simplified meshes, one object after the other. What follows
 is done once, for the winner alone, with finer meshes and every pixel. A pose changes only where the cost of the whole
-scene (equation 9) agrees, or where depth cannot tell two poses apart and colour can.
+scene (equation 9) agrees, or where depth hardly tells two poses apart and the photograph does.
 """
 
 from __future__ import annotations
@@ -14,31 +14,38 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.arrays import Floats
-from stages.geometry.poses import symmetry_angle
-from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.filter.particle_filter import Rectangle
-from stages.perception.filter.proposals import Dof, Proposals
-from stages.perception.filter.settings import FilterSettings
+from stages.perception.refinement.colour import load, log_odds
 from stages.perception.hypotheses.composition import fit, scene_cost
-from stages.perception.refinement.colour import Contender, Paint, Verdict, judge
 from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
+from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.rendering.paint import Paint
+from stages.perception.filter.particle_filter import Rectangle
+from stages.perception.filter.settings import FilterSettings
+from stages.geometry.poses import compose, rotate, rotation_angle, symmetry_angle
+from stages.perception.filter.proposals import Dof, Proposals
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
+from stages.geometry.arrays import Floats
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _GAIN = 5e-6
 """Metres per visible pixel by which a moved object must lower the scene's cost."""
-_LOYAL = 0.2
-"""Share of what counts as equal by which a flip must be cheaper to be depth's favourite, not the present pose."""
 _SAME = np.deg2rad(12.0)
 """Two poses closer than this, modulo symmetry, are one."""
 _ROUGH = 3
-_PROMISING = 6
-_HOPE = 6.0
-"""Steps by which all flips are polished first, and how many are polished in full: only those whose cost then exceeds
-the present one's by less than so many times what counts as equal."""
-_YAW_STEP = np.deg2rad(15.0)
-"""Between the turns about a continuous axis at which an object's colours are compared."""
+_HOPE = 3.0
+"""Steps by which all flips are polished first; in full only those whose cost then exceeds the present one's by less
+than so many times the mean distance of the visible pixels."""
+_WINDOW = 1.0
+"""Colour is asked about poses that cost at most this share of the mean distance more, for each visible pixel."""
+_NATS = 3.0
+"""What a pose that costs as much more as all that the best one leaves is less likely: sensors' errors are no noise that
+many pixels average out."""
+_YAW_STEP = np.deg2rad(10.0)
+"""Between the turns about a continuous axis at which an object is compared with the photograph."""
+_UPRIGHT = 0.9
+"""Cosine of the angle to the vertical below which a turn would lay an upright object down."""
+_FACING = np.deg2rad(15.0)
+"""Turns within this show the same side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,10 +65,7 @@ class RefinementSettings:
     contact: bool = True
     """Penetration and floating cost."""
     colour: bool = True
-    """Colour decides between poses that depth finds equal."""
-    equal: float = 0.5
-    """Depth finds poses equal whose costs differ by less than this share of the mean distance of the visible pixels
-    at the better one: by less than what the sensor's noise and the mesh's errors leave of any pose."""
+    """The photograph has a say between poses that depth hardly tells apart, and turns symmetric objects."""
 
     @staticmethod
     def of(filter_settings: FilterSettings) -> RefinementSettings:
@@ -88,10 +92,8 @@ class Considered:
 
     T_camera_object: Floats
     """3 x 4."""
-    depth: float
-    """By how much the scene costs more (metres times pixels, contact included) than at the cheapest pose."""
-    colour: float | None
-    """Mean distance of its colours from the image, CIELAB units; None where colour was not asked or saw too little."""
+    nats: float
+    """Log-odds of the chosen pose against it, by depth and colour."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,9 @@ class RefinedObject:
     visible: float
     """Share of its silhouette that nothing hides."""
     considered: tuple[Considered, ...]
-    """The poses that depth found equal: the chosen one first, then the others, cheapest first."""
+    """The other poses that depth hardly tells from the chosen one, modulo symmetry, the likeliest first."""
+    facing: float | None
+    """How likely it faces as the pose says, if that is right modulo symmetry; None without symmetries or colour."""
     penetration: float = 0.0
     """How deep it and another object reach into each other, metres."""
     sunk: float = 0.0
@@ -143,6 +147,10 @@ class SceneRefiner:
         scene = ObservedScene.of(depth, depth > 2, K, T_camera_table)
         placed = [Placed(next(iter(self._catalogue.objects)), T_camera_table)] * 2
         self.refine(scene, np.zeros((48, 64, 3), np.uint8), placed)
+        if self._settings.colour:
+            # So small an image is not looked at.
+            self._model(placed[0].label).paint.drawn(T_camera_table[:3], scene.view)
+            load()
 
     def refine(self, scene: ObservedScene, rgb: NDArray[np.uint8], placed: Sequence[Placed]) -> RefinedScene:
         """Polishes all objects together and settles flips; ``rgb`` is H x W x 3, sRGB, registered to the depth."""
@@ -166,11 +174,14 @@ class _Model:
         self.item = item
         self.shape = Shape.of(item.simplified(settings.triangles))
         self.proposals = Proposals.of(item, settings.dof)
-        self.symmetries = item.symmetries.transforms(_YAW_STEP)
+        turns = item.symmetries.transforms(_YAW_STEP)
+        self.turns = turns if settings.dof == 6 else turns[turns[:, 2, 2] > _UPRIGHT]
+        """Exact symmetries, of which depth knows nothing, identity first."""
 
     def prepare(self) -> None:
-        """Makes what takes time, but for the paint: few objects are ever asked for their colour."""
+        """Makes what takes time."""
         assert self.solid
+        assert self.paint
 
     @cached_property
     def solid(self) -> Solid:
@@ -179,7 +190,7 @@ class _Model:
 
     @cached_property
     def paint(self) -> Paint:
-        """The full mesh's colours."""
+        """The full mesh with its colours."""
         return Paint.of(self.item.mesh)
 
 
@@ -192,8 +203,8 @@ class _Place:
     directions: Floats
     visible: float
     """Pixels that show the object."""
-    equal: float
-    """Costs that differ by less are equal, metres times pixels."""
+    misfit: float
+    """What the present pose leaves of these pixels' readings, metres times pixels."""
 
 
 class _Joint:
@@ -208,6 +219,7 @@ class _Joint:
         self._settings = settings
         self._layers = [self._layer(i) for i in range(len(models))]
         self._considered: list[tuple[Considered, ...]] = [()] * len(models)
+        self._facing: list[float | None] = [None] * len(models)
 
     def polish(self) -> None:
         """Moves one object after the other, the others fixed, until a whole round changes nothing."""
@@ -217,7 +229,7 @@ class _Joint:
             stale = {j for i in moved for j in range(len(self._models)) if self._touches(i, j)}
 
     def settle(self, rgb: NDArray[np.uint8]) -> None:
-        """Chooses between each object's flips, by depth and then by colour, and polishes again if any turned."""
+        """Chooses between each object's flips, by depth and colour, and polishes again if any turned."""
         turned = [self._settle(i, rgb) for i in range(len(self._models))]
         if any(turned):
             self.polish()
@@ -239,54 +251,52 @@ class _Joint:
         return better
 
     def _settle(self, i: int, rgb: NDArray[np.uint8]) -> bool:
+        """Moves an object to the likeliest of its flips and symmetric turns; whether its shape moved."""
         place = self._place(i)
-        poses, totals = self._equals(i, place)
-        verdict = self._verdict(i, place, poses, rgb) if len(poses) > 1 else None
-        winner = 0 if verdict is None else verdict.winner
-        self._considered[i] = _considered(poses, totals, verdict, winner)
-        turned = not np.array_equal(poses[winner], self._poses[i])
-        if turned:
-            self._move(i, poses[winner])
-        return turned
+        poses, odds = self._contenders(i, place)
+        turns = self._models[i].turns if self._settings.colour else np.eye(4)[None]
+        faced = _turned(poses, turns)
+        odds = odds[:, None] + self._colours(i, place, faced, rgb)
+        flip, turn = divmod(int(np.argmax(odds)), len(turns))
+        shape_moved = not np.array_equal(poses[flip], self._poses[i])
+        self._move(i, faced[flip, turn])
+        self._considered[i] = _considered(poses, odds.max(1), flip)
+        self._facing[i] = _facing(faced[flip], odds[flip], turn) if len(turns) > 1 else None
+        return shape_moved
 
-    def _equals(self, i: int, place: _Place) -> tuple[Floats, Floats]:
-        """Depth's favourite, then the poses that depth finds equal to it, cheapest first, and what they cost.
+    def _contenders(self, i: int, place: _Place) -> tuple[Floats, Floats]:
+        """Poses that depth hardly tells apart, its favourite first, A x 3 x 4, and what it says for each, nats.
 
-        They are the present pose and its polished flips, no two the same modulo the object's symmetries. The present
-        one is the favourite unless another is cheaper by a fifth of what counts as equal.
+        They are the present pose and its polished flips, no two the same modulo the object's symmetries.
         """
+        present = self._poses[i][None]
         flips = self._flips(i, place)
-        present = self._totals(i, place, self._poses[i][None])
-        flips = flips[place.likelihood.costs(flips) <= present[0] + place.equal]
-        poses = np.concatenate([self._poses[i][None], flips])
-        totals = np.concatenate([present, self._totals(i, place, flips)])
-        ranks = totals - _LOYAL * place.equal * (np.arange(len(totals)) == 0)
-        kept = _distinct(poses, ranks, self._models[i].item.symmetries.transforms())
-        kept = [k for k in kept if totals[k] <= totals.min() + place.equal]
-        return poses[kept], totals[kept]
+        most = place.likelihood.costs(present) + _WINDOW * place.misfit
+        poses = np.concatenate([present, flips[place.likelihood.costs(flips) <= most]])
+        totals = self._totals(i, place, poses)
+        kept = _distinct(poses, totals, self._models[i].item.symmetries.transforms())
+        excess = (totals[kept] - totals.min()) / place.misfit
+        return poses[kept][excess <= _WINDOW], -_NATS * excess[excess <= _WINDOW]
 
     def _flips(self, i: int, place: _Place) -> Floats:
         """Those of the object's flips that are worth a full polish, polished."""
         settings = self._settings
         flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
         rough = place.likelihood.refine(flips, place.directions, steps=_ROUGH, gate=2 * settings.gate)
-        present, *costs = place.likelihood.costs(np.concatenate([self._poses[i][None], rough])).tolist()
-        order = np.argsort(costs, kind="stable")[:_PROMISING]
-        promising = rough[[k for k in order.tolist() if costs[k] < present + _HOPE * place.equal]]
+        present, *costs = place.likelihood.costs(np.concatenate([self._poses[i][None], rough]))
+        promising = rough[np.array(costs) < present + _HOPE * place.misfit]
         return place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
 
-    def _verdict(self, i: int, place: _Place, poses: Floats, rgb: NDArray[np.uint8]) -> Verdict | None:
+    def _colours(self, i: int, place: _Place, faced: Floats, rgb: NDArray[np.uint8]) -> Floats:
+        """What the photograph says for each of A x S poses, nats."""
         if not self._settings.colour:
-            return None
+            return np.zeros(faced.shape[:2])
         x0, y0, x1, y1 = place.region
         window, model = place.likelihood.window, self._models[i]
-        layers = [inverse_depth(model.shape.soup, pose, window.view) for pose in poses]
-        visible = np.logical_and.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
-        contenders = [Contender(*each) for each in zip(poses, layers, strict=True)]
-        return judge(
-            rgb[y0:y1, x0:x1], window.view, visible, contenders,
-            paint=model.paint, symmetries=model.symmetries,
-        )  # fmt: skip
+        layers = [inverse_depth(model.shape.soup, T, window.view) for T in faced[:, 0]]
+        shown = np.logical_and.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
+        found = log_odds(rgb[y0:y1, x0:x1], window.view, shown, faced.reshape(-1, 3, 4), model.paint)
+        return found.reshape(faced.shape[:2])
 
     def _place(self, i: int) -> _Place:
         """Costs of poses of one object about where it is, with all others fixed, at full resolution.
@@ -304,7 +314,7 @@ class _Joint:
         cost, share = fit(scene, layer, background, self._settings.cost)
         visible = float(share * (layer > 0).sum())
         directions = self._models[i].proposals.directions(scene.T_camera_table)
-        return _Place(region, likelihood, directions, visible, self._settings.equal * cost * visible)
+        return _Place(region, likelihood, directions, visible, cost * max(1.0, visible))
 
     def _totals(self, i: int, place: _Place, poses: Floats) -> Floats:
         """What the scene costs with the object at each of the poses, up to a constant: depth and contact."""
@@ -322,7 +332,7 @@ class _Joint:
         others = [self._scene.plane_inverse, *(layer for j, layer in enumerate(self._layers) if j != i)]
         cost, visible = fit(self._scene, self._layers[i], np.maximum.reduce(others), self._settings.cost)
         return RefinedObject(
-            self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i],
+            self._models[i].label, self._poses[i], self._layers[i], cost, visible, self._considered[i], self._facing[i],
             penetration=float(touching.penetration[i].max()), sunk=float(touching.sunk[i]),
         )  # fmt: skip
 
@@ -348,10 +358,22 @@ def _distinct(poses: Floats, ranks: Floats, symmetries: Floats) -> list[int]:
     return kept
 
 
-def _considered(poses: Floats, totals: Floats, verdict: Verdict | None, winner: int) -> tuple[Considered, ...]:
-    order = [winner, *(k for k in np.argsort(totals, kind="stable").tolist() if k != winner)]
-    colours = [None] * len(poses) if verdict is None else verdict.distances.tolist()
-    return tuple(Considered(poses[k], float(totals[k] - totals.min()), colours[k]) for k in order)
+def _turned(poses: Floats, turns: Floats) -> Floats:
+    """Poses A x 3 x 4 after turns S x 4 x 4 in the object's own frame, A x S x 3 x 4."""
+    R, t = poses[:, None, :, :3], poses[:, None, :, 3]
+    return np.concatenate([compose(R, turns[:, :3, :3]), (rotate(R, turns[:, :3, 3]) + t)[..., None]], -1)
+
+
+def _considered(poses: Floats, odds: Floats, chosen: int) -> tuple[Considered, ...]:
+    order = [k for k in np.argsort(-odds, kind="stable").tolist() if k != chosen]
+    return tuple(Considered(poses[k], float(odds[chosen] - odds[k])) for k in order)
+
+
+def _facing(faced: Floats, odds: Floats, chosen: int) -> float:
+    """The share of the likelihood that shows the chosen side, of the turns S x 3 x 4 of one pose."""
+    weights = np.exp(odds - odds.max())
+    same = rotation_angle(faced[:, :, :3], faced[chosen, :, :3]) <= _FACING
+    return float(weights[same].sum() / weights.sum())
 
 
 def _shown(window: Window, layer: Float32s, form: CostForm) -> NDArray[np.bool_]:

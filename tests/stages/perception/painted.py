@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
 
-from stages.geometry.arrays import Floats
-from stages.perception.refinement.colour import surface_normals
+from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
+from stages.geometry.arrays import Floats
 from stages.scene.catalogue import Mesh
 
 LIGHT = np.array([0.3, -0.5, -0.8])
@@ -21,10 +20,18 @@ def painted(objects: list[tuple[Mesh, Floats]], view: View, *, ambient: float = 
     for mesh, T in objects:
         layer = inverse_depth(Soup.of(mesh), T, view)
         shown = layer > nearest
-        points = (view.rays()[shown] / layer[shown][:, None] - T[:3, 3]) @ T[:3, :3]
-        colors = mesh.colors[KDTree(mesh.vertices).query(points)[1]]
+        colors, _ = Paint.of(mesh).drawn(T, view)
         # Gradients of inverse depth point away from the camera.
-        shade = ambient + (1 - ambient) * np.clip(surface_normals(layer, view)[shown] @ -LIGHT, 0, 1)
-        image[shown] = colors * shade[:, None]
+        shade = ambient + (1 - ambient) * np.clip(_normals(layer, view)[shown] @ -LIGHT, 0, 1)
+        image[shown] = colors[shown] * shade[:, None]
         nearest = np.maximum(nearest, layer)
     return (image + rng.normal(0, noise, image.shape)).clip(0, 255).astype(np.uint8)
+
+
+def _normals(layer: np.ndarray, view: View) -> np.ndarray:
+    """Unit normals of a rendered surface, H x W x 3; inverse depth is linear on a plane."""
+    down, right = np.gradient(layer.astype(np.float64))
+    rays = view.rays()
+    x, y = right * view.fx, down * view.fy
+    normals = np.stack([x, y, layer - rays[..., 0] * x - rays[..., 1] * y], -1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)

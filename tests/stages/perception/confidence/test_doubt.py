@@ -79,7 +79,7 @@ def test_colour_settles_what_depth_cannot_see() -> None:
         Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE)
         .assess(seen.scene, [Judged("soup_can", T, 0.9, rivals)], np.zeros(1), 0)
         .objects[0]
-        for rivals in ((), (Rival(flipped, colour=5.0),))
+        for rivals in ((), (Rival(flipped, nats=10.0),))
     )
     assert after.probability > before.probability and after.evidence.margin > before.evidence.margin + 3
     assert before.shares and not after.shares

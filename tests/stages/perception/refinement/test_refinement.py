@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3, pose, symmetry_angle
 from stages.perception.filter.settings import FilterSettings
+from stages.geometry.poses import exp_so3, pose, rotation_angle, symmetry_angle
 from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
+from stages.geometry.arrays import Floats
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.painted import painted
 from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
@@ -68,9 +68,25 @@ def test_a_can_upside_down_is_put_right(seen: Rendered, refiner: SceneRefiner) -
 def test_colour_decides_where_depth_finds_poses_equal(seen: Rendered, refiner: SceneRefiner) -> None:
     can = refiner.refine(seen.scene, image(seen, can=OVER), nudged(seen)).objects[0]
     assert symmetry_angle(can.T_camera_object[:, :3], (seen.poses["soup_can"] @ OVER)[:3, :3], SPIN) < np.deg2rad(3)
-    chosen, other = can.considered
-    assert chosen.depth > other.depth == 0
-    assert chosen.colour is not None and other.colour is not None and chosen.colour < other.colour
+    (other,) = can.considered
+    assert symmetry_angle(other.T_camera_object[:, :3], seen.poses["soup_can"][:3, :3], SPIN) < np.deg2rad(3)
+    assert other.nats > 3
+
+
+def test_symmetric_objects_are_turned_until_their_label_faces_as_in_the_image(
+    seen: Rendered, refiner: SceneRefiner
+) -> None:
+    placed = nudged(seen, can=pose(exp_so3(np.array([0.0, 0.0, 2.5])), np.zeros(3)))
+    can, box = refiner.refine(seen.scene, image(seen), placed).objects
+    # The can's label is printed twice.
+    twice = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
+    assert symmetry_angle(can.T_camera_object[:, :3], seen.poses["soup_can"][:3, :3], twice) < np.deg2rad(8)
+    assert can.facing == pytest.approx(0.5, abs=0.05)
+    assert rotation_angle(box.T_camera_object[:, :3], seen.poses["tea_box"][:3, :3]) < np.deg2rad(3)
+    assert box.facing is not None and box.facing > 0.7
+    plain = SceneRefiner(Catalogue(PLAIN), RefinementSettings())
+    can = plain.refine(seen.scene, image(seen, Catalogue(PLAIN)), placed).objects[0]
+    assert can.facing == pytest.approx(3 / 36, abs=0.01)
 
 
 @pytest.mark.parametrize("why", ["switched off", "no image", "no colour"])
@@ -112,8 +128,8 @@ def digest() -> str:
     seen = render({"soup_can": PLACED["soup_can"]})
     placed = [Placed("soup_can", seen.poses["soup_can"] @ NUDGE)]
     (can,) = SceneRefiner(CATALOGUE, RefinementSettings()).refine(seen.scene, image(seen, can=OVER), placed).objects
-    colours = repr([each.colour for each in can.considered]).encode()
-    return hashlib.sha256(can.T_camera_object.tobytes() + can.layer.tobytes() + colours).hexdigest()
+    odds = repr((can.facing, [each.nats for each in can.considered])).encode()
+    return hashlib.sha256(can.T_camera_object.tobytes() + can.layer.tobytes() + odds).hexdigest()
 
 
 def test_another_process_finds_the_same_bytes() -> None:
