@@ -21,16 +21,21 @@ Mask = NDArray[np.bool_]
 
 _SIDE = 128
 """Pixels along the square to which the object and what is around it are scaled."""
-_REACH = 9
-"""Pixels of the photograph by which colour may lie beside depth."""
+_REACH = np.deg2rad(0.8)
+"""Angle by which colour may lie beside depth: what wrong extrinsics and the parallax between two lenses leave."""
 _MARGIN = 4
 """Pixels around the object besides."""
+_RIM = 2.5
+"""Pixels along an outline that show what is behind as well."""
+_RING = 6
+"""Pixels around the object, whose median stands for what would be seen were it not there."""
 _LEAST = 60
 """Pixels of the photograph below which nothing can be read."""
 _GAIN = 2.0
 """Contrast of the photograph relative to the paint's, at most: what is more is no paint."""
-_LIKE = 25.0
-"""Grey levels by which paints must differ to be told apart: by more than light, print and camera change one paint."""
+_LIKE = 40.0
+"""Grey levels (root of the sum over the channels) by which drawn poses must differ to be told apart: by more than the
+shades that were scanned with the paint, and light, print and camera, change equal colours."""
 _NATS = 30.0
 """For a unit of mean cosine, summed over the layers."""
 
@@ -46,22 +51,24 @@ def load() -> None:
 def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, paint: Paint) -> Floats:
     """How much better the photograph suits one pose than another: nats up to a constant, P; all 0 where it cannot say.
 
-    ``rgb`` is H x W x 3 (sRGB), ``shown`` H x W: where the object can be seen at every pose; ``poses`` are P x 3 x 4
-    rows of T_camera_object.
+    ``rgb`` is H x W x 3 (sRGB), ``shown`` H x W: where the object would be seen at any pose, nothing in front of it;
+    ``poses`` are P x 3 x 4 rows of T_camera_object.
     """
     if len(poses) < 2 or shown.sum() < _LEAST:
         return np.zeros(len(poses))
-    crop = _Crop.around(shown, view)
-    drawn, covered = zip(*(paint.drawn(T, crop.view) for T in poses), strict=True)
-    everywhere = np.logical_and.reduce([crop.cut(shown.astype(np.float32)) > 0.99, *covered])
-    # Pixels at the outline show what is behind the object as well.
-    inner = cv2.erode(everywhere.astype(np.uint8), np.ones((2 * int(2 * crop.scale) + 3,) * 2, np.uint8)) > 0
-    if inner.sum() < _LEAST * crop.scale**2:
+    reach = _REACH * view.fx
+    crop = _Crop.around(shown, view, int(reach) + _MARGIN)
+    drawn, covered = (np.stack(each) for each in zip(*(paint.drawn(T, crop.view) for T in poses), strict=True))
+    covered &= crop.cut(shown.astype(np.float32)) > 0.5
+    common, any_pose = _shrunk(covered.all(0), crop.scale), covered.any(0)
+    if common.sum() < _LEAST * crop.scale**2:
         return np.zeros(len(poses))
     photograph = crop.cut(rgb.astype(np.float32))
-    lit = _lit(np.stack(drawn), photograph, inner)
-    pasted = np.where(everywhere[..., None], lit, photograph)
-    return _NATS * _told_apart(lit[:, inner]) * _likeness(photograph, pasted, inner, _REACH * crop.scale)
+    around = cv2.dilate(any_pose.astype(np.uint8), _square(_RING * crop.scale)) > any_pose
+    empty = np.where(any_pose[..., None], np.median(photograph[around], 0), photograph)
+    pasted = np.where(covered[..., None], _lit(drawn, photograph, common), empty)
+    inner = _shrunk(any_pose, crop.scale)
+    return _NATS * _told_apart(pasted[:, inner]) * _likeness(photograph, pasted, inner, reach * crop.scale)
 
 
 @dataclass(frozen=True)
@@ -74,11 +81,11 @@ class _Crop:
     view: View
 
     @staticmethod
-    def around(mask: Mask, view: View) -> _Crop:
-        """What surrounds a mask that is not empty."""
+    def around(mask: Mask, view: View, margin: int) -> _Crop:
+        """A mask that is not empty, and at least so many pixels around it."""
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
-        side = int((high - low).max()) + 1 + 2 * (_REACH + _MARGIN)
+        side = int((high - low).max()) + 1 + 2 * margin
         left, top = ((low + high + 1 - side) // 2).tolist()
         scale = _SIDE / side
         cx, cy = (view.cx - left + 0.5) * scale - 0.5, (view.cy - top + 0.5) * scale - 0.5
@@ -97,12 +104,22 @@ class _Crop:
         return np.asarray(cv2.resize(part, (_SIDE, _SIDE), interpolation=way), np.float32)
 
 
-def _lit(paints: Float32s, photograph: Float32s, inner: Mask) -> Float32s:
-    """Paints (P x S x S x 3) in the photograph's light: mean of each channel, and contrast.
+def _shrunk(mask: Mask, scale: float) -> Mask:
+    """A mask without its rim, whose pixels show what is behind as well."""
+    return cv2.erode(mask.astype(np.uint8), _square(_RIM * scale)) > 0
+
+
+def _square(reach: float) -> NDArray[np.uint8]:
+    """All that is so many pixels away, along rows and columns."""
+    return np.ones((2 * int(reach) + 1,) * 2, np.uint8)
+
+
+def _lit(paints: Float32s, photograph: Float32s, common: Mask) -> Float32s:
+    """Paints (P x S x S x 3) in the photograph's light: mean of each channel, and contrast, where all poses have paint.
 
     One light for all poses: were each free to choose its own, a black lid in bright light would be a white one.
     """
-    seen, paint = photograph[inner], paints[:, inner]
+    seen, paint = photograph[common], paints[:, common]
     gain = min(float(seen.std()) / max(float(paint.std()), 1.0), _GAIN)
     return (paints - paint.mean((0, 1))) * gain + seen.mean(0)
 

@@ -294,7 +294,7 @@ class _Joint:
         x0, y0, x1, y1 = place.region
         window, model = place.likelihood.window, self._models[i]
         layers = [inverse_depth(model.shape.soup, T, window.view) for T in faced[:, 0]]
-        shown = np.logical_and.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
+        shown = np.logical_or.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
         found = log_odds(rgb[y0:y1, x0:x1], window.view, shown, faced.reshape(-1, 3, 4), model.paint)
         return found.reshape(faced.shape[:2])
 
