@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Float32s, View
-from stages.geometry.arrays import Floats
 
 Mask = NDArray[np.bool_]
 
@@ -58,15 +58,16 @@ def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, pai
         return np.zeros(len(poses))
     reach = _REACH * view.fx
     crop = _Crop.around(shown, view, int(reach) + _MARGIN)
-    drawn, covered = (np.stack(each) for each in zip(*(paint.drawn(T, crop.view) for T in poses), strict=True))
-    covered &= crop.cut(shown.astype(np.float32)) > 0.5
-    common, any_pose = _shrunk(covered.all(0), crop.scale), covered.any(0)
+    drawn, covers = zip(*(paint.drawn(T, crop.view) for T in poses), strict=True)
+    covered: Mask = np.stack(covers) & (crop.cut(shown.astype(np.float32)) > 0.5)
+    any_pose: Mask = np.logical_or.reduce(covered)
+    common = _shrunk(np.logical_and.reduce(covered), crop.scale)
     if common.sum() < _LEAST * crop.scale**2:
         return np.zeros(len(poses))
     photograph = crop.cut(rgb.astype(np.float32))
-    around = cv2.dilate(any_pose.astype(np.uint8), _square(_RING * crop.scale)) > any_pose
+    around = (cv2.dilate(any_pose.astype(np.uint8), _square(_RING * crop.scale)) > 0) & ~any_pose
     empty = np.where(any_pose[..., None], np.median(photograph[around], 0), photograph)
-    pasted = np.where(covered[..., None], _lit(drawn, photograph, common), empty)
+    pasted = np.where(covered[..., None], _lit(np.stack(drawn), photograph, common), empty)
     inner = _shrunk(any_pose, crop.scale)
     return _NATS * _told_apart(pasted[:, inner]) * _likeness(photograph, pasted, inner, reach * crop.scale)
 

@@ -14,17 +14,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.perception.refinement.colour import load, log_odds
-from stages.perception.hypotheses.composition import fit, scene_cost
-from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
-from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
-from stages.perception.rendering.paint import Paint
-from stages.perception.filter.particle_filter import Rectangle
-from stages.perception.filter.settings import FilterSettings
-from stages.geometry.poses import compose, rotate, rotation_angle, symmetry_angle
-from stages.perception.filter.proposals import Dof, Proposals
-from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import compose, rotate, rotation_angle, symmetry_angle
+from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.filter.particle_filter import Rectangle
+from stages.perception.filter.proposals import Dof, Proposals
+from stages.perception.filter.settings import FilterSettings
+from stages.perception.hypotheses.composition import fit, scene_cost
+from stages.perception.refinement.colour import load, log_odds
+from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
+from stages.perception.rendering.paint import Paint
+from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
 _GAIN = 5e-6

@@ -12,9 +12,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.pixel_math import KERNEL, screen_matrix, triangle_setup
 from stages.perception.rendering.rasteriser import Float32s, View, kernel_pose
-from stages.geometry.arrays import Floats
 from stages.scene.catalogue import Mesh
 
 _f = np.float32

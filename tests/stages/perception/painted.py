@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
-from stages.geometry.arrays import Floats
 from stages.scene.catalogue import Mesh
 
 LIGHT = np.array([0.3, -0.5, -0.8])

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from stages.geometry.poses import exp_so3, pose
 from stages.perception.refinement.colour import log_odds
 from stages.perception.rendering.paint import Paint
-from stages.geometry.poses import exp_so3, pose
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
 from tests.stages.perception.painted import painted

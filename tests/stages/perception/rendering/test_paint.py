@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.perception.rendering.paint import Paint
 from stages.geometry.poses import exp_so3, pose
+from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
 from tests.stages.perception.scenes import CATALOGUE
