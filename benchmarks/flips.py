@@ -128,13 +128,14 @@ class _Comparison:
 
     def case(self, image: Image, observation: Observation, ranked: SceneEstimate) -> Case:
         """One image with what becomes of its ranked scene."""
-        before, after = (_refined(refiner, observation, ranked, self._catalogue) for refiner in self._refiners)
+        before, after = (refined(refiner, observation, ranked, self._catalogue) for refiner in self._refiners)
         return Case(image, _results(ranked, ranked.objects, self._catalogue), before, after)
 
 
-def _refined(
+def refined(
     refiner: SceneRefiner, observation: Observation, ranked: SceneEstimate, catalogue: Catalogue
 ) -> tuple[Result, ...]:
+    """The objects of a ranked scene as a refiner leaves them."""
     scene = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
     placed = [Placed(item.label, item.T_camera_object) for item in ranked.objects]
     found = refiner.refine(scene, observation.rgb, placed).objects

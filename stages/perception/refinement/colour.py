@@ -21,8 +21,6 @@ Mask = NDArray[np.bool_]
 
 _SIDE = 128
 """Pixels along the square to which the object and what is around it are scaled."""
-_REACH = np.deg2rad(0.8)
-"""Angle by which colour may lie beside depth: what wrong extrinsics and the parallax between two lenses leave."""
 _MARGIN = 4
 """Pixels around the object besides."""
 _RIM = 2.5
@@ -33,11 +31,19 @@ _LEAST = 60
 """Pixels of the photograph below which nothing can be read."""
 _GAIN = 2.0
 """Contrast of the photograph relative to the paint's, at most: what is more is no paint."""
-_LIKE = 40.0
-"""Grey levels (root of the sum over the channels) by which drawn poses must differ to be told apart: by more than the
-shades that were scanned with the paint, and light, print and camera, change equal colours."""
-_NATS = 30.0
-"""For a unit of mean cosine, summed over the layers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourSettings:
+    """What a photograph's likeness to a drawn pose is worth."""
+
+    nats: float = 30.0
+    """For a unit of mean cosine, summed over the layers."""
+    alike: float = 40.0
+    """Grey levels (root of the sum over the channels) by which drawn poses must differ to be told apart: by more than
+    the shades that were scanned with the paint, and light, print and camera, change equal colours."""
+    reach: float = np.deg2rad(0.8)
+    """Angle by which colour may lie beside depth: what wrong extrinsics and the parallax between two lenses leave."""
 
 
 def load() -> None:
@@ -48,7 +54,9 @@ def load() -> None:
     Backbone.pretrained()
 
 
-def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, paint: Paint) -> Floats:
+def log_odds(
+    rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, *, paint: Paint, settings: ColourSettings
+) -> Floats:
     """How much better the photograph suits one pose than another: nats up to a constant, P; all 0 where it cannot say.
 
     ``rgb`` is H x W x 3 (sRGB), ``shown`` H x W: where the object would be seen at any pose, nothing in front of it;
@@ -56,7 +64,7 @@ def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, pai
     """
     if len(poses) < 2 or shown.sum() < _LEAST:
         return np.zeros(len(poses))
-    reach = _REACH * view.fx
+    reach = settings.reach * view.fx
     crop = _Crop.around(shown, view, int(reach) + _MARGIN)
     drawn, covers = zip(*(paint.drawn(T, crop.view) for T in poses), strict=True)
     covered: Mask = np.stack(covers) & (crop.cut(shown.astype(np.float32)) > 0.5)
@@ -69,7 +77,8 @@ def log_odds(rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, pai
     empty = np.where(any_pose[..., None], np.median(photograph[around], 0), photograph)
     pasted = np.where(covered[..., None], _lit(np.stack(drawn), photograph, common), empty)
     inner = _shrunk(any_pose, crop.scale)
-    return _NATS * _told_apart(pasted[:, inner]) * _likeness(photograph, pasted, inner, reach * crop.scale)
+    worth = settings.nats * _told_apart(pasted[:, inner], settings.alike)
+    return worth * _likeness(photograph, pasted, inner, reach * crop.scale)
 
 
 @dataclass(frozen=True)
@@ -125,13 +134,13 @@ def _lit(paints: Float32s, photograph: Float32s, common: Mask) -> Float32s:
     return (paints - paint.mean((0, 1))) * gain + seen.mean(0)
 
 
-def _told_apart(colors: Float32s) -> float:
+def _told_apart(colors: Float32s, alike: float) -> float:
     """How much of a difference between poses is paint, 0 to 1; of colours P x K x 3.
 
     What looks alike at all poses, for it has one colour, differs by noise and by shading.
     """
     spread = float(((colors - colors.mean(0)) ** 2).sum(-1).mean())
-    return spread / (spread + _LIKE**2)
+    return spread / (spread + alike**2)
 
 
 def _likeness(photograph: Float32s, pasted: Float32s, inner: Mask, reach: float) -> Floats:

@@ -21,7 +21,7 @@ from stages.perception.filter.particle_filter import Rectangle
 from stages.perception.filter.proposals import Dof, Proposals
 from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import fit, scene_cost
-from stages.perception.refinement.colour import load, log_odds
+from stages.perception.refinement.colour import ColourSettings, load, log_odds
 from stages.perception.refinement.contact import Contacts, Solid, apparent, contacts, penalty
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
@@ -66,6 +66,8 @@ class RefinementSettings:
     """Penetration and floating cost."""
     colour: bool = True
     """The photograph has a say between poses that depth hardly tells apart, and turns symmetric objects."""
+    reading: ColourSettings = field(default_factory=ColourSettings)
+    """How the photograph is read."""
 
     @staticmethod
     def of(filter_settings: FilterSettings) -> RefinementSettings:
@@ -295,7 +297,8 @@ class _Joint:
         window, model = place.likelihood.window, self._models[i]
         layers = [inverse_depth(model.shape.soup, T, window.view) for T in faced[:, 0]]
         shown = np.logical_or.reduce([_shown(window, layer, self._settings.cost) for layer in layers])
-        found = log_odds(rgb[y0:y1, x0:x1], window.view, shown, faced.reshape(-1, 3, 4), model.paint)
+        poses, reading = faced.reshape(-1, 3, 4), self._settings.reading
+        found = log_odds(rgb[y0:y1, x0:x1], window.view, shown, poses, paint=model.paint, settings=reading)
         return found.reshape(faced.shape[:2])
 
     def _place(self, i: int) -> _Place:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.poses import exp_so3, pose
-from stages.perception.refinement.colour import log_odds
+from stages.perception.refinement.colour import ColourSettings, log_odds
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
@@ -28,7 +28,7 @@ SHOWN = inverse_depth(Soup.of(CAN), STANDING, VIEW) > 0
 
 
 def odds(rgb: np.ndarray, *, shown: np.ndarray = SHOWN, mesh: Mesh = CAN) -> np.ndarray:
-    return log_odds(rgb, VIEW, shown, POSES, Paint.of(mesh))
+    return log_odds(rgb, VIEW, shown, POSES, paint=Paint.of(mesh), settings=ColourSettings())
 
 
 @pytest.mark.parametrize("true", [2, 17])
