@@ -1,8 +1,7 @@
 """Whether settings that some sensors chose suit another: `python -m benchmarks.sensors DATASET [DATASET ...]`.
 
 Every image is filtered once, with exact boxes, and its ranked scene refined with each of several settings of how the
-photograph is read. For each sensor the settings that do best on the images of
-all others are judged on its own.
+photograph is read. For each sensor the settings that do best on the images of all others are judged on its own.
 """
 
 from __future__ import annotations

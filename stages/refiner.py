@@ -1,4 +1,4 @@
-"""The ranked scene in, the same scene refined out: joint polish at full resolution, flips and labels settled by colour."""
+"""The ranked scene in, the same scene refined out: joint polish at full resolution, colour settles flips and labels."""
 
 from __future__ import annotations
 
