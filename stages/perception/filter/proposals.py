@@ -99,6 +99,10 @@ class Proposals:
         turning = np.abs(directions[:3]).sum(0) > 0
         steps = rng.normal(size=(len(poses), directions.shape[1])) * np.where(turning, radians, metres)
         twists = (directions[None] * steps[:, None, :]).sum(-1)
+        return self.moved(poses, twists)
+
+    def moved(self, poses: Floats, twists: Floats) -> Floats:
+        """Poses after a turn about the object's centre and a shift each, P x 6, camera frame."""
         return _moved(np.ascontiguousarray(poses), self._centre, twists)
 
     def flipped(self, poses: Floats, T_camera_table: Floats, rng: np.random.Generator) -> Floats:

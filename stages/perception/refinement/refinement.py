@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,14 @@ _GAIN = 5e-6
 _SAME = np.deg2rad(12.0)
 """Two poses closer than this, modulo symmetry, are one."""
 _ROUGH = 3
-_HOPE = 3.0
-"""Steps by which all flips are polished first; in full only those whose cost then exceeds the present one's by less
-than so many times the mean distance of the visible pixels."""
+_PROMISING = 12
+_HOPE = 6.0
+"""Steps by which all flips are polished first, and how many are slid; polished in full are only those whose cost then
+exceeds the present one's by less than so many times the mean distance of the visible pixels."""
+_SLIDES = ((0.012, np.deg2rad(10.0)), (0.005, np.deg2rad(4.0)))
+"""Metres and radians by which flips are slid and turned, the greater first."""
+_SIDES = np.array(list(product((0.0, -1.0, 1.0), repeat=3)))
+"""Every way to turn and slide, staying first, 27 x 3."""
 _WINDOW = 1.0
 """Colour is asked about poses that cost at most this share of the mean distance more, for each visible pixel."""
 _NATS = 3.0
@@ -285,9 +291,24 @@ class _Joint:
         settings = self._settings
         flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
         rough = place.likelihood.refine(flips, place.directions, steps=_ROUGH, gate=2 * settings.gate)
-        present, *costs = place.likelihood.costs(np.concatenate([self._poses[i][None], rough]))
-        promising = rough[np.array(costs) < present + _HOPE * place.misfit]
+        slid = self._slid(i, place, rough[np.argsort(place.likelihood.costs(rough), kind="stable")[:_PROMISING]])
+        most = place.likelihood.costs(self._poses[i][None]) + _HOPE * place.misfit
+        promising = slid[place.likelihood.costs(slid) < most]
         return place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
+
+    def _slid(self, i: int, place: _Place, poses: Floats) -> Floats:
+        """Poses slid and turned in the image (upright objects: on the plane) where that costs less.
+
+        A polish sees surfaces but no outlines: what is flat would stay beside where it lies.
+        """
+        ways = place.directions[:, 2:5] if self._settings.dof == 6 else place.directions
+        for metres, radians in _SLIDES:
+            steps = _SIDES * np.where(np.abs(ways[:3]).sum(0) > 0, radians, metres)
+            twists = np.tile((ways * steps[:, None]).sum(-1), (len(poses), 1))
+            around = self._models[i].proposals.moved(np.repeat(poses, len(_SIDES), 0), twists)
+            best = place.likelihood.costs(around).reshape(-1, len(_SIDES)).argmin(1)
+            poses = around.reshape(-1, len(_SIDES), 3, 4)[np.arange(len(poses)), best]
+        return poses
 
     def _colours(self, i: int, place: _Place, faced: Floats, rgb: NDArray[np.uint8]) -> Floats:
         """What the photograph says for each of A x S poses, nats."""
