@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks import accuracy
 from benchmarks.accuracy import interval, read_views, recalls, score
-from benchmarks.common.datasets import read_truth
+from benchmarks.common.datasets import Truth, read_truth
 from stages.devices.bop_results import HEADER, Result
 from stages.devices.clutter import write_clutter
-from stages.geometry.poses import pose
+from stages.geometry.poses import exp_so3, pose
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.scenes import CATALOGUE
 
@@ -58,6 +58,20 @@ def test_the_command_prints_a_table_or_json(
     assert values["1 cm and 10 degrees"] == pytest.approx(share) and values["right_sets"] == 0
     assert values["VSD recall"] == pytest.approx(share, abs=0.01)
     assert sum(entry["adds"] is None for entry in values["objects"]) == 1
+
+
+def test_where_it_is_known_how_a_label_faces_a_symmetric_turn_is_wrong() -> None:
+    can = CATALOGUE["soup_can"]
+    T = pose(np.eye(3), np.array([0.0, 0.0, 0.7]))
+    over = pose(exp_so3(np.array([0.0, 0.0, np.deg2rad(40)])), np.zeros(3))
+    truth = Truth((1, 0), can.label, T, label_known=True)
+    for turned in (False, True):
+        result = Result(1, 0, can.label, 1.0, T @ over if turned else T, 0.5)
+        (one,) = score([truth], [result], CATALOGUE)
+        assert one.within(0.001, 1) and one.label_right != turned
+        assert accuracy.failed([one]) == ([one] if turned else [])
+        printed = accuracy.table([one], (1, 1))
+        assert f"label faces right      {'  0.0' if turned else '100.0'} %" in printed
 
 
 def test_intervals_are_those_of_wilson() -> None:
