@@ -67,3 +67,8 @@ def listed(items: Sequence[str], joint: str = ", ") -> str:
     """The first few, and how many more there are."""
     more = f" and {len(items) - FEW} more" if len(items) > FEW else ""
     return f"{joint.join(items[:FEW])}{more}"
+
+
+def has_display() -> bool:
+    """Whether windows can be opened."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

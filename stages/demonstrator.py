@@ -15,6 +15,7 @@ from stages.messages import (
     Arrangement,
     Assertion,
     Goal,
+    Look,
     LookRequest,
     Observation,
     Outcome,
@@ -22,6 +23,7 @@ from stages.messages import (
     Restore,
     RobotState,
     SceneGraph,
+    Stop,
     Task,
     Teach,
     Transfer,
@@ -29,6 +31,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.scene import SceneObject
+from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
@@ -79,6 +82,8 @@ class State:
     """Key of every transfer that failed or missed its relation, in order."""
     complaint: str = ""
     """Why the newest transfer failed; empty where it reached its relation."""
+    stopping: bool = False
+    """Somebody asked to stop: what is waited for is the last."""
 
 
 class Demonstrator(Stage):
@@ -154,6 +159,19 @@ class Demonstrator(Stage):
         ctx.log(f'restores the goal "{restore.name}"')
         return self._look(f"restore {restore.name}")
 
+    def on_look(self, look: Look, ctx: Context) -> LookRequest:
+        """Looks without a goal."""
+        self._begin("", None)
+        ctx.log("looks at what is there")
+        return self._look("look")
+
+    def on_stop(self, stop: Stop, ctx: Context) -> None:
+        """Lets what is under way come to its end, and nothing follow it."""
+        if self._state.phase in (Phase.IDLE, Phase.DONE):
+            raise Refused("nothing is under way")
+        self._state = replace(self._state, stopping=True)
+        ctx.log(f"stops after {self._state.phase.value}")
+
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
         """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
         return self._look(self._state.purpose) if self._state.phase is Phase.ARRANGING else None
@@ -163,6 +181,12 @@ class Demonstrator(Stage):
     ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict]:
         """Remembers the goal, or compares the scene with it and asks for a plan where they differ."""
         if self._state.phase is not Phase.LOOKING:
+            return
+        if self._state.stopping:
+            yield self._stopped(ctx)
+            return
+        if not self._state.goal_name:
+            self._state = replace(self._state, phase=Phase.IDLE)
             return
         scene = self._memory.complete(scene_graph, self._state.known, observation)
         self._state = replace(
@@ -184,6 +208,8 @@ class Demonstrator(Stage):
         """Starts the plan's first transfer, or gives up where there is none."""
         if self._state.phase is not Phase.PLANNING:
             return None
+        if self._state.stopping:
+            return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
         if plan.status == "solved":
             return self._proceed(plan, ctx)
@@ -193,7 +219,7 @@ class Demonstrator(Stage):
             return self._look_again("executor", f"{self._state.complaint}; no other way: {plan.reason}", ctx)
         return self._look_again("planner", plan.reason, ctx)
 
-    def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | None:
+    def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
         """Looks at what the transfer did, whether it claims success or not."""
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
             return None
@@ -203,6 +229,8 @@ class Demonstrator(Stage):
             f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
             level="info" if outcome.success else "warning",
         )
+        if self._state.stopping:
+            return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
 
@@ -301,6 +329,10 @@ class Demonstrator(Stage):
     def _fail(self, stage: str, reason: str, ctx: Context) -> Verdict:
         ctx.log(f"giving up: {reason}", level="error")
         return self._conclude(stage, reason, ctx)
+
+    def _stopped(self, ctx: Context) -> Verdict:
+        ctx.log("stopped, as asked")
+        return self._conclude(STOPPED, "stopped, as asked", ctx)
 
     def _conclude(self, failed_stage: str, reason: str, ctx: Context) -> Verdict:
         state = self._state

@@ -109,6 +109,11 @@ class Supervisor:
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
 
+    @property
+    def id(self) -> str:
+        """Of the run."""
+        return self._run.id
+
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

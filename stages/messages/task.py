@@ -8,6 +8,9 @@ from stages.messages.scene import Assertion, SceneGraph
 
 FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release"]
 
+STOPPED = "stop"
+"""Stands where a verdict names the stage that failed: somebody asked to stop."""
+
 
 class Arrangement(Message, frozen=True, kw_only=True):
     """Asks the person (scripted, in simulation) to lay out a scene."""
@@ -99,6 +102,7 @@ class Verdict(Message, frozen=True, kw_only=True):
     goal_name: str
     success: bool
     failed_stage: str
+    """Empty for a success, :data:`STOPPED` where somebody asked for the end."""
     reason: str
     satisfied: tuple[Assertion, ...]
     violated: tuple[Assertion, ...]
@@ -124,6 +128,16 @@ class Restore(Command, frozen=True, kw_only=True):
 
     name: str
     """Of a goal that was taught."""
+
+
+class Look(Command, frozen=True, kw_only=True):
+    """Looks, for people to see what is there now; nothing is remembered."""
+
+
+class Stop(Command, frozen=True, kw_only=True):
+    """Ends what is under way: the robot first puts down what it holds, and begins nothing more."""
+
+    answers = (Verdict,)
 
 
 class Arrange(Command, frozen=True, kw_only=True):

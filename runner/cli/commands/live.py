@@ -1,8 +1,9 @@
-"""Commands on graphs that run: ``ps``, ``logs``, ``topic``, ``call``, ``restart``, ``down``."""
+"""Commands on graphs that run: ``ps``, ``logs``, ``topic``, ``call``, ``restart``, ``page``, ``down``."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +42,13 @@ def add_commands(commands: Commands) -> None:
     restart = add(commands, "restart", _restart, "replace a process in order: it finishes its step, nothing is lost")
     completed(restart.add_argument("process", metavar="STAGE[.REPLICA]"), completion.processes)
     _add_run(restart)
+
+    page = add(commands, "page", _page, "serve a page on the running graph, for people who do not program")
+    page.add_argument(
+        "--address", default="127.0.0.1", help="where it is; beyond this machine RUNNER_PAGE_TOKEN must be set"
+    )
+    page.add_argument("--port", type=int, default=0, help="any that is free by default")
+    _add_run(page)
 
     _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
 
@@ -143,6 +151,17 @@ def _field(text: str) -> tuple[str, str]:
 def _restart(options: argparse.Namespace) -> None:
     with _reached(options) as live:
         print(live.restart(options.process))
+
+
+def _page(options: argparse.Namespace) -> None:
+    from runner.page.start import require_page
+    from runner.supervise.registry import find_run
+
+    require_page()
+    from runner.page.server import serve
+
+    token = os.environ.pop("RUNNER_PAGE_TOKEN", "")
+    serve(find_run(options.run), address=options.address, port=options.port, token=token)
 
 
 def _down(options: argparse.Namespace) -> None:

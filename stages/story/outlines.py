@@ -1,0 +1,76 @@
+"""The edges of estimated objects in the image that they were seen in."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from runner.page.story import Outline, Surety
+from stages.geometry.arrays import Floats
+from stages.messages import ObjectPose, SceneEstimate
+from stages.messages.scene import UnknownRegion
+from stages.scene.catalogue import Catalogue, Mesh
+from stages.scene.text import SURE
+from stages.story.words import Words
+
+TRIANGLES = 400
+"""Of an object, for its edge."""
+UNSURE = 0.5
+"""Probability below which an object is called doubtful."""
+COARSE_PIXELS = 1.0
+"""How far a drawn edge may be off."""
+
+
+def outlines(estimate: SceneEstimate, catalogue: Catalogue, size: tuple[int, int], words: Words) -> tuple[Outline, ...]:
+    """Every object of an estimate, the farthest first, and what no object explains; ``size`` is H, W."""
+    objects = sorted(estimate.objects, key=lambda item: -item.T_camera_object[2, 3])
+    found = [
+        Outline(item.name, words.bare(item.name), surety(item), how_sure(item, words), points)
+        for item in objects
+        if (points := _edge(catalogue[item.label].simplified(TRIANGLES), item.T_camera_object, estimate.K, size))
+    ]
+    unknown = words.say("unknown_label")
+    regions = (
+        Outline(region_name(number), unknown, "unknown", unknown, _corners(region))
+        for number, region in enumerate(estimate.unknown)
+    )
+    return (*found, *regions)
+
+
+def region_name(number: int) -> str:
+    """By which statements refer to something unknown."""
+    return f"unknown_{number}"
+
+
+def surety(item: ObjectPose) -> Surety:
+    """Whether an object's pose can be relied on; one that was not judged is taken for sure."""
+    probability = 1.0 if item.probability is None else item.probability
+    if item.contradicted or probability < UNSURE:
+        return "doubtful"
+    return "sure" if probability >= SURE else "unsure"
+
+
+def how_sure(item: ObjectPose, words: Words) -> str:
+    """The same in words."""
+    return words.say(surety(item), percent=round(100 * (item.probability or 0.0)))
+
+
+def _edge(mesh: Mesh, T: Floats, K: Floats, size: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+    """The outer edge of a mesh's largest part in sight; nothing where it is behind the camera or beside the image."""
+    points = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    if (points[:, 2] <= 0).any():
+        return ()
+    pixels = (points @ K.T)[:, :2] / points[:, 2:]
+    mask = np.zeros(size, np.uint8)
+    for corners in pixels[mesh.faces].round().astype(np.int32):
+        cv2.fillConvexPoly(mask, corners, 1)
+    edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not edges:
+        return ()
+    largest = max(edges, key=cv2.contourArea)
+    return tuple((int(x), int(y)) for x, y in cv2.approxPolyDP(largest, COARSE_PIXELS, closed=True)[:, 0])
+
+
+def _corners(region: UnknownRegion) -> tuple[tuple[int, int], ...]:
+    x0, y0, x1, y1 = (round(float(edge)) for edge in region.box)
+    return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
