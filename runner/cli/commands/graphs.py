@@ -23,6 +23,9 @@ def add_commands(commands: Commands) -> None:
     where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
     add_recordings(up, "where recordings go")
+    up.add_argument(
+        "--verbose", action="store_true", help="say when each process is ready, and what stages say for debugging"
+    )
     seen = up.add_mutually_exclusive_group()
     seen.add_argument("--view", action="store_true", help="open the viewer")
     seen.add_argument("--steps-only", action="store_true", help="record no messages: nothing can be replayed")
@@ -60,7 +63,7 @@ def _supervise(options: argparse.Namespace) -> int:
     from runner.supervise.supervisor import Supervisor
     from runner.terminal import Terminal
 
-    terminal = Terminal()
+    terminal = Terminal(verbose=options.verbose)
     gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, options.settings)
     if options.page or graph.page:
@@ -98,7 +101,7 @@ def _take_part(options: argparse.Namespace, document: Document, host: str) -> in
 
     refuse_settings(options.settings, host)
     become_clean("runner.cli", *options.arguments)
-    terminal = Terminal()
+    terminal = Terminal(verbose=options.verbose)
     forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
     end = Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
     terminal.plain(end.reason)
