@@ -105,14 +105,43 @@ class Card:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Something on a map."""
+
+    name: str
+    label: str
+    points: tuple[tuple[float, float], ...]
+    """Its edge, x and y in metres."""
+    x: float
+    """Where it is said to be, metres."""
+    y: float
+    movable: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Map:
+    """Things seen from above, x upwards and y to the left; moving one calls a command that takes name, x and y."""
+
+    title: str
+    hint: str
+    ground: tuple[tuple[float, float], ...]
+    """The edge of what they stand on, metres."""
+    places: tuple[Place, ...]
+    """What lies lower first."""
+    stage: str
+    command: str
+
+
+@dataclass(frozen=True, slots=True)
 class Doing:
     """What goes on now."""
 
     text: str
     busy: bool = False
+    steps: tuple[str, ...] = ()
+    """What is planned in all, with what is done of it."""
     step: int = 0
-    """Of :attr:`steps`, from 1; 0 where there are none."""
-    steps: int = 0
+    """The one of them that is at work or comes next, from 1; 0 where there are none."""
     since_ns: int = 0
     """When it began, nanoseconds since the epoch."""
 
@@ -138,6 +167,7 @@ class Told:
     view: View | None = None
     statements: tuple[Statement, ...] = ()
     actions: tuple[Action, ...] = ()
+    map: Map | None = None
     cards_title: str = ""
     cards_hint: str = ""
     """Shown where there are no cards."""

@@ -147,3 +147,13 @@ class Arrange(Command, frozen=True, kw_only=True):
     """The scene to be shown, or a disturbed one."""
     draw: int = 0
     """Each number draws another scene of that kind."""
+
+
+class Move(Command, frozen=True, kw_only=True):
+    """Puts an object of the simulated world elsewhere, as a person would."""
+
+    name: str
+    x: float
+    """Metres in front of the robot's base."""
+    y: float
+    """Metres to its left."""

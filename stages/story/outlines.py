@@ -1,4 +1,4 @@
-"""The edges of estimated objects in the image that they were seen in."""
+"""The edges of objects in the image that they were seen in, and from above."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 
 from runner.page.story import Outline, Surety
 from stages.geometry.arrays import Floats
-from stages.messages import ObjectPose, SceneEstimate
+from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import UnknownRegion
-from stages.scene.catalogue import Catalogue, Mesh
+from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
 from stages.scene.text import SURE
 from stages.story.words import Words
 
@@ -17,6 +17,8 @@ TRIANGLES = 400
 """Of an object, for its edge."""
 UNSURE = 0.5
 """Probability below which an object is called doubtful."""
+MARGIN = 0.2
+"""Metres of ground about the objects, where nobody knows how far it goes."""
 COARSE_PIXELS = 1.0
 """How far a drawn edge may be off."""
 
@@ -53,6 +55,28 @@ def surety(item: ObjectPose) -> Surety:
 def how_sure(item: ObjectPose, words: Words) -> str:
     """The same in words."""
     return words.say(surety(item), percent=round(100 * (item.probability or 0.0)))
+
+
+def footprint(entry: CatalogueObject, T_base_object: Floats) -> tuple[tuple[float, float], ...]:
+    """What an object covers seen from above, x and y in metres: its convex hull."""
+    mesh = entry.simplified(TRIANGLES)
+    points = (mesh.vertices @ T_base_object[:3, :3].T + T_base_object[:3, 3])[:, :2]
+    return _pairs(np.float64(cv2.convexHull(points.astype(np.float32))[:, 0]))
+
+
+def ground(scene: SceneGraph) -> tuple[tuple[float, float], ...]:
+    """The support surface as far as it was seen; where nobody knows, what surrounds the objects."""
+    if scene.support is not None:
+        T = scene.T_base_table
+        return _pairs(scene.support @ T[:2, :2].T + T[:2, 3])
+    points = np.array([item.T_base_object[:2, 3] for item in scene.objects])
+    (x0, y0), (x1, y1) = points.min(0) - MARGIN, points.max(0) + MARGIN
+    return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+
+def _pairs(points: Floats) -> tuple[tuple[float, float], ...]:
+    """To the millimetre."""
+    return tuple((round(float(x), 3), round(float(y), 3)) for x, y in points)
 
 
 def _edge(mesh: Mesh, T: Floats, K: Floats, size: tuple[int, int]) -> tuple[tuple[int, int], ...]:

@@ -7,8 +7,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
+
 from runner.contract import Message, Refused
-from runner.page.story import Action, Ask, Card, Doing, Heard, Language, Notice, Photo, Statement, Told, View
+from runner.page.story import (
+    Action,
+    Ask,
+    Card,
+    Doing,
+    Heard,
+    Language,
+    Map,
+    Notice,
+    Photo,
+    Place,
+    Statement,
+    Told,
+    View,
+)
 from stages.messages import (
     Arrange,
     Arrangement,
@@ -16,6 +32,7 @@ from stages.messages import (
     Goal,
     Look,
     LookRequest,
+    Move,
     ObjectPose,
     Outcome,
     Plan,
@@ -25,13 +42,15 @@ from stages.messages import (
     Stop,
     Task,
     Teach,
+    Transfer,
     TransferRequest,
     Verdict,
 )
+from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import Catalogue
 from stages.scene.text import support
-from stages.story.outlines import how_sure, outlines, region_name, surety
+from stages.story.outlines import footprint, ground, how_sure, outlines, region_name, surety
 from stages.story.words import Words, words_of
 
 DEMONSTRATOR, WORLD = "demonstrator", "world"
@@ -40,7 +59,7 @@ NAME = r"[\p{L}\p{N}_\-]+"
 """What the name of a goal may be."""
 SHOWN_FAULTS = 4
 """Relations that do not hold, of a goal that was not reached."""
-Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "put_on", "put_in"]
+Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "move"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +70,12 @@ class Job:
     """Of the goal; empty for a look."""
     began_ns: int
     phase: Phase = "look"
-    transfer: TransferRequest | None = None
     done: int = 0
     """Transfers that have ended."""
-    steps: int = 0
-    """Transfers in all, as the newest plan has it; 0 where there is none."""
+    transfers: tuple[Transfer, ...] = ()
+    """Those and what the newest plan adds."""
+    holders: frozenset[str] = frozenset()
+    """Objects that things are put into rather than onto."""
     stopping: bool = False
 
 
@@ -71,7 +91,7 @@ class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
     hears: tuple[type[Message], ...] = (
-        *(Teach, Restore, Look, Stop, Arrange, Arrangement, LookRequest, Frame, SceneEstimate, SceneGraph),
+        *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, LookRequest, Frame, SceneEstimate, SceneGraph),
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
     )
 
@@ -117,8 +137,11 @@ class Story:
                 self._estimate = estimate
             case SceneGraph() as scene:
                 self._see(scene)
-            case Arrange() | Arrangement() as arranged:
+            case Move() as move:
                 self._moved = True
+                self._scene = self._scene and _with_moved(self._scene, move)
+            case Arrange() | Arrangement() as arranged:
+                self._moved, self._scene = True, None
                 self._draws += arranged.kind == "start"
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
@@ -132,15 +155,15 @@ class Story:
         match message:
             case Stop():
                 self._job = replace(self._job, stopping=True)
-            case Task():
-                self._at("plan")
+            case Task(current=scene):
+                holders = {item.name for item in scene.objects if self._catalogue[item.label].concave}
+                self._job = replace(self._job, phase="plan", holders=frozenset(holders))
             case Plan(transfers=transfers):
-                self._job = replace(self._job, steps=self._job.done + len(transfers))
-            case TransferRequest() as request:
-                inside = request.transfer.destination in self._holders(request.scene)
-                self._job = replace(self._job, transfer=request, phase="put_in" if inside else "put_on")
+                self._job = replace(self._job, transfers=(*self._job.transfers[: self._job.done], *transfers))
+            case TransferRequest():
+                self._at("move")
             case Outcome(number=number):
-                self._moved = True
+                self._moved, self._scene = True, None
                 self._job = replace(self._job, done=number)
             case _:
                 pass
@@ -186,10 +209,6 @@ class Story:
             self._goals[end.name] = Remembered(end, self._photo)
         self._ended, self._job = (end, id), None
 
-    def _holders(self, scene: SceneGraph) -> set[str]:
-        """Objects that things are put into rather than onto."""
-        return {item.name for item in scene.objects if self._catalogue[item.label].concave}
-
     # ------------------------------------------------------------------------------------------ what is told
 
     def tell(self, language: Language) -> Told:
@@ -201,6 +220,7 @@ class Story:
             view=self._view(words),
             statements=tuple(self._statements(words)),
             actions=tuple(self._actions(words)) if self._commanded else (),
+            map=self._map(words),
             cards_title=words.say("goals"),
             cards_hint=words.say("no_goals"),
             cards=tuple(self._card(name, kept, words) for name, kept in self._goals.items()),
@@ -210,15 +230,13 @@ class Story:
         job = self._job
         if job is None:
             return Doing(words.say("idle" if self._commanded else "script"))
-        request = job.transfer
-        parts = (
-            {"object": words.noun(request.transfer.object), "destination": words.noun(request.transfer.destination)}
-            if request
-            else {}
-        )
-        text = words.say("stopping" if job.stopping else job.phase, name=job.name, **parts)
-        step = min(job.done + 1, job.steps)
-        return Doing(text, busy=True, step=step, steps=job.steps, since_ns=job.began_ns)
+        steps = tuple(_move(transfer, job, words) for transfer in job.transfers)
+        step = min(job.done + 1, len(steps))
+        if job.stopping:
+            text = words.say("stopping")
+        else:
+            text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
+        return Doing(text, True, steps, step, job.began_ns)
 
     def _view(self, words: Words) -> View | None:
         if self._photo is None:
@@ -228,13 +246,18 @@ class Story:
         return View(self._photo, words.say("outdated" if self._moved else "seen"), found)
 
     def _statements(self, words: Words) -> Iterator[Statement]:
-        if self._scene is None:
-            return
+        if self._moved and self._job is None:
+            yield Statement(words.say("moved"), surety="unknown")
+        elif self._scene is not None:
+            yield from self._known(self._scene, words)
+
+    def _known(self, scene: SceneGraph, words: Words) -> Iterator[Statement]:
+        """What is there, and what stands on, in or next to what."""
         judged = {item.name: item for item in self._estimate.objects} if self._estimate else {}
         beside: dict[str, list[str]] = {}
-        for virtual in self._scene.virtual_objects:
+        for virtual in scene.virtual_objects:
             beside.setdefault(virtual.child, []).append(virtual.parent)
-        for name, (supporter, how) in support(self._scene).items():
+        for name, (supporter, how) in support(scene).items():
             text = words.say(f"is_{how}", child=words.noun(name), supporter=words.noun(supporter))
             if name in beside:
                 text += words.say("beside", parents=words.nouns(beside[name]))
@@ -255,6 +278,27 @@ class Story:
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
         yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
+
+    def _map(self, words: Words) -> Map | None:
+        """The scene from above, where people may move what carries nothing."""
+        scene = self._scene
+        if scene is None or not (self._simulated and self._commanded and self._job is None):
+            return None
+        carried = support(scene)
+        carriers = {supporter for supporter, _ in carried.values()}
+        objects = sorted(scene.objects, key=lambda item: item.T_base_object[2, 3])
+        places = tuple(
+            Place(
+                item.name,
+                words.bare(item.name),
+                footprint(self._catalogue[item.label], item.T_base_object),
+                float(item.T_base_object[0, 3]),
+                float(item.T_base_object[1, 3]),
+                item.name not in carriers,
+            )
+            for item in objects
+        )
+        return Map(words.say("map"), words.say("map_hint"), ground(scene), places, WORLD, "move")
 
     def _card(self, name: str, kept: Remembered, words: Words) -> Card:
         names = [item.name for item in kept.goal.scene.objects]
@@ -299,3 +343,21 @@ class Story:
 
 def _statement(text: str, name: str, item: ObjectPose | None, words: Words) -> Statement:
     return Statement(text, name) if item is None else Statement(text, name, surety(item), how_sure(item, words))
+
+
+def _move(transfer: Transfer, job: Job, words: Words) -> str:
+    """A transfer as a sentence."""
+    key = "put_in" if transfer.destination in job.holders else "put_on"
+    return words.say(key, object=words.noun(transfer.object), destination=words.noun(transfer.destination))
+
+
+def _with_moved(scene: SceneGraph, move: Move) -> SceneGraph:
+    """A scene in which somebody has put an object elsewhere; the next look says what it stands on now."""
+    objects = (_moved(item, move) if item.name == move.name else item for item in scene.objects)
+    return msgspec.structs.replace(scene, objects=tuple(objects))
+
+
+def _moved(item: SceneObject, move: Move) -> SceneObject:
+    T = item.T_base_object.copy()
+    T[:2, 3] = move.x, move.y
+    return msgspec.structs.replace(item, T_base_object=T)

@@ -1,6 +1,7 @@
 // For the person who shows the scene: what is seen, what goes on, what can be done.
 
 import {html, nothing, svg} from "./lit-html.js";
+import {map} from "./map.js";
 import {button, lasted} from "./parts.js";
 
 const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
@@ -16,6 +17,7 @@ export function scene(page) {
       ${doing(page, told)}
       ${offered.length ? html`<section aria-labelledby="do"><h2 id="do">${page.say("do")}</h2>
         ${offered.map((action) => button(page, action))}</section>` : nothing}
+      ${told.map ? map(page, told.map) : nothing}
     </div>
     ${statements(page, told)}
     ${told.cards_title ? cards(page, told) : nothing}
@@ -72,8 +74,10 @@ function doing(page, told) {
   return html`<section class="doing ${busy ? "busy" : ""}" aria-labelledby="now">
     <h2 id="now">${page.say("now")}</h2>
     <p class="what" role="status">${text}</p>
-    ${steps ? html`<progress max=${steps} value=${step - 1} aria-label=${page.say("progress")}></progress>` : nothing}
-    <p class="quiet">${[steps ? page.say("step", {step, steps}) : "",
+    ${steps.length ? html`<progress max=${steps.length} value=${step - 1} aria-label=${page.say("progress")}></progress>
+      <ol class="steps">${steps.map((one, k) => html`<li class=${k + 1 < step ? "past" : ""}
+        aria-current=${k + 1 === step ? "step" : nothing}>${one}</li>`)}</ol>` : nothing}
+    <p class="quiet">${[steps.length ? page.say("step", {step, steps: steps.length}) : "",
       busy && since_ns ? lasted(Date.now() / 1000 - since_ns / 1e9) : ""].filter(Boolean).join(" · ")}</p>
     ${notice(page, told.notice)}
     ${page.calls.filter((call) => call.refused).slice(-1).map((call) => html`

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
+from websockets.sync.client import connect
 
 from runner.contract import Refused
 from runner.page.guard import new_token
@@ -159,6 +160,46 @@ def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None
     page.get_by_role("button", name="Dizzy").click()
     refusal = page.get_by_role("alert").filter(has_text="makes people dizzy")
     expect(refusal).to_have_text("That does not work: times=10: makes people dizzy; valid: 1 to 9")
+
+
+def test_things_are_moved_by_mouse_and_by_keys(page: Page) -> None:
+    thing = page.get_by_role("button", name="lamp", exact=True)
+    thing.scroll_into_view_if_needed()
+    box = thing.bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 0.5 * box["width"], y - 0.5 * box["height"], steps=4)  # a tenth of a metre, as it is 0.2 wide
+    page.mouse.up()
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    x, y = carried(page, 1)
+    assert (x, y) == pytest.approx((0.6, -0.1), abs=0.02)
+    page.goto(f"{page.url.partition('#')[0]}#scene")
+    thing.focus()
+    for key in ("ArrowLeft", "ArrowLeft", "ArrowDown", "Enter"):
+        page.keyboard.press(key)
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    assert carried(page, 2) == pytest.approx((x - 0.02, y + 0.04), abs=0.006)
+
+
+def carried(page: Page, times: int) -> tuple[float, float]:
+    """Where the lamp was carried last, once it was so often."""
+    lines = page.get_by_role("log").get_by_text("carried to")
+    expect(lines).to_have_count(times)
+    x, y = lines.first.inner_text().split()[-2:]
+    return float(x), float(y)
+
+
+def test_a_page_that_stands_still_keeps_nobody_waiting(lamp: Lamp, page: Page) -> None:
+    place = urlsplit(lamp.url)
+    with connect(f"ws://{place.netloc}{place.path}live", max_queue=1, max_size=None, close_timeout=0.1) as still:
+        still.send(json.dumps({"view": "engineer", "language": "en"}))
+        for number in range(200):
+            body = json.dumps({"stage": "lamp", "command": "switch", "arguments": {"note": f"{number} {'x' * 4000}"}})
+            assert asked(lamp.url, f"{place.path}call", "POST", body)[0] == 200
+        page.goto(f"{lamp.url}#engineer")
+        expect(page.get_by_role("log")).to_contain_text("is dark 199")
 
 
 def test_escape_stops_wherever_the_focus_is(page: Page) -> None:

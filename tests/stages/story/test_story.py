@@ -20,6 +20,7 @@ from stages.messages import (
     Goal,
     Look,
     LookRequest,
+    Move,
     ObjectPose,
     Restore,
     SceneEstimate,
@@ -213,8 +214,42 @@ def test_a_picture_says_when_it_is_outdated() -> None:
         view = listener.told().view
         assert view is not None
         captions.append(view.caption)
+    assert [one.text for one in listener.told().statements] == []
     seen, moved = "What the robot saw last", "What the robot saw before something was moved"
     assert captions == [seen, moved, seen]
+
+
+def test_what_was_moved_is_not_claimed_to_be_where_it_was() -> None:
+    listener = Listener()
+    listener.called(Look())
+    listener.seen(START)
+    for message in (Move(name="cup", x=0.6, y=0.1), Arrange(kind="goal")):
+        listener.hear(message)
+        (only,) = listener.told().statements
+        assert only.text == "Something was moved since. Let the robot look again."
+
+
+def test_the_map_shows_what_can_be_moved_and_where_it_was_put() -> None:
+    listener = Listener()
+    listener.called(Look())
+    assert listener.told().map is None
+    listener.seen(GOAL)
+    found = listener.told("de").map
+    assert found is not None
+    assert [(one.label, one.movable) for one in found.places] == [
+        *(("Tablett", False), ("Teeschachtel", True), ("Tasse", True))
+    ]
+    cup = Catalogue.load(BUILT_IN)["cup"]
+    edge = np.array(found.places[2].points) - [found.places[2].x, found.places[2].y]
+    assert np.allclose(edge.min(0), cup.bounds[0, :2], atol=0.002) and np.allclose(
+        edge.max(0), cup.bounds[1, :2], atol=0.002
+    )
+    assert np.array(found.ground).min() < min(one.y for one in found.places)
+    listener.hear(Move(name="cup", x=0.61, y=0.15))
+    moved = listener.told().map
+    assert moved is not None and (moved.places[2].x, moved.places[2].y) == (0.61, 0.15)
+    listener.hear(Arrange(kind="start"))
+    assert listener.told().map is None
 
 
 def test_every_disturbance_is_another() -> None:
@@ -274,7 +309,8 @@ def test_a_restore_is_told_step_by_step() -> None:
     other = transfer("tea_box", "table", "table")
     listener.hear(plan(STEP, other), TransferRequest(transfer=STEP, scene=START, number=1))
     doing = listener.told().doing
-    assert (doing.text, doing.step, doing.steps, doing.busy) == ("Puts the cup into the tray", 1, 2, True)
+    assert (doing.text, doing.step, doing.busy) == ("Puts the cup into the tray", 1, True)
+    assert doing.steps == ("Puts the cup into the tray", "Puts the tea box on the table")
     listener.hear(outcome(1, STEP), LookRequest(purpose="after transfer 1"))
     assert (listener.doing, listener.told().doing.step) == ("Looks whether it is where it belongs", 2)
     listener.seen(START)
