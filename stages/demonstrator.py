@@ -14,6 +14,7 @@ from runner.contract import Context, Refused, Stage
 from stages.messages import (
     Arrangement,
     Assertion,
+    Forget,
     Goal,
     Look,
     LookRequest,
@@ -152,12 +153,16 @@ class Demonstrator(Stage):
 
     def on_restore(self, restore: Restore, ctx: Context) -> LookRequest:
         """Looks at what there is to do for a goal."""
-        goals = self._state.goals
-        if restore.name not in goals:
-            raise Refused(f"name={restore.name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
-        self._begin(restore.name, goals[restore.name])
+        self._begin(restore.name, self._goal(restore.name))
         ctx.log(f'restores the goal "{restore.name}"')
         return self._look(f"restore {restore.name}")
+
+    def on_forget(self, forget: Forget, ctx: Context) -> None:
+        """Strikes a goal off; one that is being restored still is."""
+        self._goal(forget.name)
+        goals = {name: goal for name, goal in self._state.goals.items() if name != forget.name}
+        self._state = replace(self._state, goals=goals)
+        ctx.log(f'goal "{forget.name}" forgotten')
 
     def on_look(self, look: Look, ctx: Context) -> LookRequest:
         """Looks without a goal."""
@@ -233,6 +238,12 @@ class Demonstrator(Stage):
             return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
+
+    def _goal(self, name: str) -> SceneGraph:
+        goals = self._state.goals
+        if name not in goals:
+            raise Refused(f"name={name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
+        return goals[name]
 
     def _begin(self, name: str, goal: SceneGraph | None) -> None:
         """Starts from anew with a goal, or with one that is yet to be seen."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from runner.testing import finish, read_until, start_graph
+from runner.testing import finish, read_until, runner, start_graph
 from tests.runner.page.browser import browser, faults, opened
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +23,11 @@ def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: py
     (url,) = re.findall(r"page: (\S+)", printed)
     with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
         teaches(page)
+        listed = runner("goals").communicate(timeout=60)[0]
+        assert (
+            listed.startswith("breakfast\n    6 objects: the ")
+            and "runner call demonstrator restore name=breakf" in listed
+        )
         restores_and_stops(page)
         tells_it_in_german(page)
     process.terminate()

@@ -91,6 +91,8 @@ class Action:
     """``first`` is what a person most likely wants next, ``stop`` is always in sight."""
     now: bool = True
     """Whether it can be done now."""
+    confirm: str = ""
+    """A question to be answered with yes before; none by default."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,7 @@ class Watch:
 
     def start(self) -> None:
         """Begins to read, on a thread of its own."""
-        threading.Thread(target=self._read, name="watch", daemon=True).start()
+        threading.Thread(target=self.read, name="watch", daemon=True).start()
 
     def look(self, somebody: bool) -> None:
         """Goes on where somebody looks, and rests where nobody does."""
@@ -56,7 +56,8 @@ class Watch:
         with self._telling:
             return self._story.tell(language) if self._story else Told(Doing(""))
 
-    def _read(self) -> None:
+    def read(self) -> None:
+        """Reads until the run ends, or as far as it is there once it is to stop."""
         while not self._recording.exists() and not self._stopped():
             time.sleep(POLL_SECONDS)
         with open_file(self._recording) as file:
@@ -104,3 +105,11 @@ class Watch:
                 self._story.hear(heard)
         except Exception as error:
             print(f"{entry.topic} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
+
+
+def told_so_far(recording: Path, language: Language) -> Told:
+    """What there is to say of a run now."""
+    watch = Watch(recording, lambda: None, lambda: True)
+    watch.look(True)
+    watch.read()
+    return watch.tell(language)

@@ -14,6 +14,7 @@ from stages.messages.sensing import Frame, LookRequest, Snapshot
 from stages.messages.task import (
     Arrange,
     Arrangement,
+    Forget,
     Goal,
     Look,
     Move,
@@ -36,6 +37,7 @@ __all__ = [
     "Candidate",
     "Candidates",
     "Depth",
+    "Forget",
     "Frame",
     "Goal",
     "Hypothesis",

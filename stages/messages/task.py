@@ -130,6 +130,13 @@ class Restore(Command, frozen=True, kw_only=True):
     """Of a goal that was taught."""
 
 
+class Forget(Command, frozen=True, kw_only=True):
+    """Forgets the goal of that name."""
+
+    name: str
+    """Of a goal that was taught."""
+
+
 class Look(Command, frozen=True, kw_only=True):
     """Looks, for people to see what is there now; nothing is remembered."""
 

@@ -61,7 +61,7 @@ def footprint(entry: CatalogueObject, T_base_object: Floats) -> tuple[tuple[floa
     """What an object covers seen from above, x and y in metres: its convex hull."""
     mesh = entry.simplified(TRIANGLES)
     points = (mesh.vertices @ T_base_object[:3, :3].T + T_base_object[:3, 3])[:, :2]
-    return _pairs(np.float64(cv2.convexHull(points.astype(np.float32))[:, 0]))
+    return _pairs(np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64))
 
 
 def ground(scene: SceneGraph) -> tuple[tuple[float, float], ...]:

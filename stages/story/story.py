@@ -28,6 +28,7 @@ from runner.page.story import (
 from stages.messages import (
     Arrange,
     Arrangement,
+    Forget,
     Frame,
     Goal,
     Look,
@@ -91,7 +92,20 @@ class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
     hears: tuple[type[Message], ...] = (
-        *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, LookRequest, Frame, SceneEstimate, SceneGraph),
+        *(
+            Teach,
+            Restore,
+            Forget,
+            Look,
+            Stop,
+            Arrange,
+            Arrangement,
+            Move,
+            LookRequest,
+            Frame,
+            SceneEstimate,
+            SceneGraph,
+        ),
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
     )
 
@@ -143,6 +157,8 @@ class Story:
             case Arrange() | Arrangement() as arranged:
                 self._moved, self._scene = True, None
                 self._draws += arranged.kind == "start"
+            case Forget(name=name):
+                self._goals.pop(name, None)
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
             case _:
@@ -306,7 +322,9 @@ class Story:
         restore = Action(
             DEMONSTRATOR, "restore", words.say("do_restore"), {"name": name}, kind="first", now=self._job is None
         )
-        return Card(name, name, text, kept.photo, (restore,) if self._commanded else ())
+        sure = words.say("forget_sure", name=name)
+        forget = Action(DEMONSTRATOR, "forget", words.say("do_forget"), {"name": name}, confirm=sure)
+        return Card(name, name, text, kept.photo, (restore, forget) if self._commanded else ())
 
     # ------------------------------------------------------------------------------------------ how it ended
 

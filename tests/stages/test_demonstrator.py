@@ -12,6 +12,7 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
     Arrangement,
+    Forget,
     Goal,
     Look,
     LookRequest,
@@ -85,7 +86,7 @@ class Episode:
         ending = msgspec.structs.replace(outcome(number, item, **fields), T_base_object=at)
         return self.take(self.stage.on_outcome(ending, self.ctx))
 
-    def called(self, command: Teach | Restore | Look | Stop) -> list[Message]:
+    def called(self, command: Teach | Restore | Forget | Look | Stop) -> list[Message]:
         handler = getattr(self.stage, f"on_{type(command).__name__.lower()}")
         return self.take(handler(command, self.ctx))
 
@@ -382,6 +383,18 @@ def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -
         assert episode.called(Stop()) == []
         stopped(episode.planned(STEP) if until == "plan" else episode.ended(1, STEP))
         assert episode.seen(GOAL) == []
+
+
+def test_a_goal_that_is_forgotten_cannot_be_restored() -> None:
+    episode = Episode(scripted=False)
+    for name in ("tea", "mess"):
+        episode.called(Teach(name=name))
+        episode.seen(GOAL)
+    assert episode.called(Forget(name="tea")) == []
+    for command in (Restore(name="tea"), Forget(name="tea")):
+        with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
+            episode.called(command)
+    assert episode.called(Restore(name="mess")) == [LookRequest(purpose="restore mess")]
 
 
 def test_commands_at_the_wrong_time_are_refused() -> None:

@@ -3,7 +3,8 @@
 import {html, nothing, svg} from "./lit-html.js";
 
 const MM = 1000; // drawn in millimetres
-const EDGE = 0.04; // metres about the ground
+const AROUND = 0.2; // metres about the things
+const UNDER = 0.025; // metres from a thing to its name
 const SHOWN_MS = 2000; // until something that was put down is shown where it is told to be, whatever has come of it
 const NUDGE = 0.02; // metres a key moves something
 const KEYS = {ArrowUp: [NUDGE, 0], ArrowDown: [-NUDGE, 0], ArrowLeft: [0, NUDGE], ArrowRight: [0, -NUDGE]};
@@ -11,10 +12,11 @@ const KEYS = {ArrowUp: [NUDGE, 0], ArrowDown: [-NUDGE, 0], ArrowLeft: [0, NUDGE]
 let held = null; // what is being moved: {name, from, by}, metres; and the place it was told to have when it was put down
 
 export function map(page, told) {
-  const xs = told.ground.map(([x]) => x), ys = told.ground.map(([, y]) => y);
-  const top = Math.max(...xs) + EDGE, left = Math.max(...ys) + EDGE;
-  const wide = left - Math.min(...ys) + EDGE, tall = top - Math.min(...xs) + EDGE;
-  return html`<section aria-labelledby="map"><h2 id="map">${told.title}</h2>
+  const points = told.places.flatMap((place) => place.points);
+  const xs = points.map(([x]) => x), ys = points.map(([, y]) => y);
+  const top = Math.max(...xs) + AROUND, left = Math.max(...ys) + AROUND;
+  const wide = left - Math.min(...ys) + AROUND, tall = top - Math.min(...xs) + AROUND;
+  return html`<section class="rearrange" aria-labelledby="map"><h2 id="map">${told.title}</h2>
     <svg class="map" viewBox="${-left * MM} ${-top * MM} ${wide * MM} ${tall * MM}" role="group" aria-labelledby="map" aria-describedby="map-hint">
       <path class="ground" d=${outline(told.ground)}></path>
       ${told.places.map((place) => thing(page, told, place))}
@@ -28,14 +30,15 @@ export function map(page, told) {
 function thing(page, told, place) {
   if (held?.put && held.name === place.name && (held.put.x !== place.x || held.put.y !== place.y)) held = null;
   const [dx, dy] = held?.name === place.name ? held.by : [0, 0];
-  const shown = svg`<path d=${outline(place.points)}></path>
-    <text x=${-place.y * MM} y=${-place.x * MM} aria-hidden="true">${place.label}</text>`;
-  const moved = `translate(${-dy * MM} ${-dx * MM})`;
+  const shown = svg`<path d=${outline(place.points)}></path>`;
   if (!place.movable) return svg`<g class="thing">${shown}</g>`;
+  const moved = `translate(${-dy * MM} ${-dx * MM})`;
+  const under = Math.min(...place.points.map(([x]) => x)) - UNDER;
   return svg`<g class="thing movable" transform=${moved} tabindex="0" role="button" aria-label=${place.label}
     @pointerdown=${(event) => hold(page, event, place)} @pointermove=${(event) => drag(page, event)}
     @pointerup=${() => drop(page, told, place)} @pointercancel=${() => release(page)}
-    @keydown=${(event) => key(page, told, place, event)} @blur=${() => drop(page, told, place)}>${shown}</g>`;
+    @keydown=${(event) => key(page, told, place, event)} @blur=${() => drop(page, told, place)}>
+    ${shown}<text x=${-place.y * MM} y=${-under * MM} aria-hidden="true">${place.label}</text></g>`;
 }
 
 /** x upwards and y to the left. */

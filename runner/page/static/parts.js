@@ -8,6 +8,7 @@ export function button(page, action, {shortcut} = {}) {
   const kind = action.kind === "plain" ? "" : action.kind;
   const send = (event) => {
     event.preventDefault();
+    if (action.confirm && !confirm(action.confirm)) return;
     const args = {...action.arguments};
     if (action.ask) args[action.ask.field] = new FormData(event.target).get("asked");
     page.call(action.stage, action.command, args);

@@ -17,9 +17,9 @@ export function scene(page) {
       ${doing(page, told)}
       ${offered.length ? html`<section aria-labelledby="do"><h2 id="do">${page.say("do")}</h2>
         ${offered.map((action) => button(page, action))}</section>` : nothing}
-      ${told.map ? map(page, told.map) : nothing}
     </div>
     ${statements(page, told)}
+    ${told.map ? map(page, told.map) : nothing}
     ${told.cards_title ? cards(page, told) : nothing}
   </div>`;
 }

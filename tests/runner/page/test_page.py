@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 
 from runner.contract import Refused
 from runner.page.guard import new_token
-from runner.testing import finish, read_until, start_graph
+from runner.testing import finish, read_until, runner, start_graph
 from tests.runner.common.waiting import wait_until
 from tests.runner.page.browser import browser, faults, opened
 
@@ -165,7 +165,7 @@ def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None
 def test_things_are_moved_by_mouse_and_by_keys(page: Page) -> None:
     thing = page.get_by_role("button", name="lamp", exact=True)
     thing.scroll_into_view_if_needed()
-    box = thing.bounding_box()
+    box = thing.locator("path").bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
@@ -258,6 +258,17 @@ def test_the_texts_of_both_languages_are_the_same_ones() -> None:
         assert sorted(re.findall(r"\{\w+\}", text)) == sorted(re.findall(r"\{\w+\}", german[key])), key
     asked_for = {key for path in static.glob("*.js") for key in re.findall(r'page\.say\("(\w+)"', path.read_text())}
     assert asked_for <= english.keys()
+
+
+def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
+    assert runner("goals").communicate(timeout=60)[0] == (
+        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n"
+    )
+    wrong = runner("goals", "A lump")
+    assert (wrong.communicate(timeout=60)[0], wrong.returncode) == (
+        "A lump: is not remembered; did you mean 'A lamp'? valid: A lamp\n",
+        2,
+    )
 
 
 # ------------------------------------------------------------------------------------------ beginning and end

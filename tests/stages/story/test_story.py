@@ -16,6 +16,7 @@ from runner.page.story import Heard, Language, Notice, Told
 from stages.messages import (
     Arrange,
     Assertion,
+    Forget,
     Frame,
     Goal,
     Look,
@@ -277,7 +278,12 @@ def test_a_goal_is_taught_and_becomes_a_card() -> None:
     (card,) = listener.told().cards
     assert (card.title, card.text) == ("tea", "3 objects: the tray, the cup and the tea box")
     assert card.photo is not None and card.photo in listener.told().photos
-    assert [(one.command, one.arguments, one.now) for one in card.actions] == [("restore", {"name": "tea"}, True)]
+    assert [(one.command, one.arguments, one.now, one.confirm) for one in card.actions] == [
+        ("restore", {"name": "tea"}, True, ""),
+        ("forget", {"name": "tea"}, True, "Forget “tea” for good?"),
+    ]
+    listener.hear(Forget(name="tea"))
+    assert listener.told().cards == ()
 
 
 @pytest.mark.parametrize("command_first", [True, False])
