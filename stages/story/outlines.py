@@ -45,15 +45,18 @@ def region_name(number: int) -> str:
 
 
 def surety(item: ObjectPose) -> Surety:
-    """Whether an object's pose can be relied on; one that was not judged is taken for sure."""
-    probability = 1.0 if item.probability is None else item.probability
-    if item.contradicted or probability < UNSURE:
+    """Whether an object's pose can be relied on; nobody knows that of one that was not judged."""
+    if item.contradicted:
         return "doubtful"
-    return "sure" if probability >= SURE else "unsure"
+    if item.probability is None or UNSURE <= item.probability < SURE:
+        return "unsure"
+    return "sure" if item.probability >= SURE else "doubtful"
 
 
 def how_sure(item: ObjectPose, words: Words) -> str:
     """The same in words."""
+    if item.probability is None and not item.contradicted:
+        return words.say("unjudged")
     return words.say(surety(item), percent=round(100 * (item.probability or 0.0)))
 
 

@@ -92,20 +92,8 @@ class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
     hears: tuple[type[Message], ...] = (
-        *(
-            Teach,
-            Restore,
-            Forget,
-            Look,
-            Stop,
-            Arrange,
-            Arrangement,
-            Move,
-            LookRequest,
-            Frame,
-            SceneEstimate,
-            SceneGraph,
-        ),
+        *(Teach, Restore, Forget, Look, Stop, Arrange, Arrangement, Move),
+        *(LookRequest, Frame, SceneEstimate, SceneGraph),
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
     )
 

@@ -80,8 +80,8 @@ function doing(page, told) {
     <p class="quiet">${[steps.length ? page.say("step", {step, steps: steps.length}) : "",
       busy && since_ns ? lasted(Date.now() / 1000 - since_ns / 1e9) : ""].filter(Boolean).join(" · ")}</p>
     ${notice(page, told.notice)}
-    ${page.calls.filter((call) => call.refused).slice(-1).map((call) => html`
-      <p class="refused" role="alert">${page.say("refused")} ${call.refused}</p>`)}
+    ${page.calls.at(-1)?.refused
+      ? html`<p class="refused" role="alert">${page.say("refused")} ${page.calls.at(-1).refused}</p>` : nothing}
   </section>`;
 }
 

@@ -193,7 +193,7 @@ def test_what_is_behind_the_camera_or_beside_the_image_has_no_outline() -> None:
     ("probability", "contradicted", "surety", "words"),
     [
         (0.97, False, "sure", "Sure"),
-        (None, False, "sure", "Sure"),
+        (None, False, "unsure", "Not judged yet"),
         (0.72, False, "unsure", "Not quite sure (72 %)"),
         (0.2, False, "doubtful", "Probably wrong"),
         (0.97, True, "doubtful", "Probably wrong"),
