@@ -154,9 +154,8 @@ def moved(name: str, x: float, y: float, layout: Layout, catalogue: Catalogue) -
             f"x={x:g} y={y:g}: beside the table; valid: {low[0]:g} to {high[0]:g} and {low[1]:g} to {high[1]:g}"
         )
     entry, others = catalogue[name], {other: T for other, T in layout.items() if other != name}
-    corners = np.array([*np.ndindex(3, 3)]) - 1
-    below = [(x, y) + corner * entry.dimensions[:2] / 2 for corner in corners]
-    height = max((_height_over(*point, others, catalogue) for point in below), default=TABLE.height)
+    corners = (np.array([*np.ndindex(3, 3)]) - 1) * entry.dimensions[:2] / 2
+    height = max(_height_over(x + dx, y + dy, others, catalogue) for dx, dy in corners.tolist())
     yaw = np.arctan2(layout[name][1, 0], layout[name][0, 0])
     return _standing(entry, x, y, yaw, height)
 
