@@ -20,10 +20,13 @@ POLL_SECONDS = 0.1
 
 
 @contextlib.contextmanager
-def running(folder: Path, name: str, stages: Mapping[str, Any]) -> Generator[Live]:
-    """Records a graph into an empty folder and asks it to end; raises Refused where it ends before it is ready."""
+def running(folder: Path, name: str, stages: Mapping[str, Any], **keys: str) -> Generator[Live]:
+    """Records a graph into an empty folder and asks it to end; raises Refused where it ends before it is ready.
+
+    ``keys`` are what the graph says beside its name and stages.
+    """
     graph = folder / "graph.yaml"
-    graph.write_text(json.dumps({"name": name, "stages": stages}))
+    graph.write_text(json.dumps({"name": name, "stages": stages, **keys}))
     command = [sys.executable, "-m", "runner.cli", "up", str(graph), "--recordings", str(folder)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as run:
         try:

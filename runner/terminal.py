@@ -19,8 +19,10 @@ _RESET = "\033[0m"
 class Terminal:
     """Prints lines; colours only where somebody looks, and not with ``NO_COLOR``."""
 
-    def __init__(self, stream: TextIO = sys.stdout):
+    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False):
+        """``verbose`` shows lines of level debug, too."""
         self._stream = stream
+        self._verbose = verbose
         self._colours = stream.isatty() and not os.environ.get("NO_COLOR")
         self._started = time.monotonic()
         self._lock = threading.Lock()
@@ -30,6 +32,8 @@ class Terminal:
 
         ``seconds`` since the start of the graph; since that of this terminal by default.
         """
+        if level == "debug" and not self._verbose:
+            return
         elapsed = time.monotonic() - self._started if seconds is None else seconds
         head = f"{elapsed:7.1f} s  {who:<{WIDTH}} "
         for line in text.splitlines() or [""]:
@@ -67,3 +71,8 @@ def listed(items: Sequence[str], joint: str = ", ") -> str:
     """The first few, and how many more there are."""
     more = f" and {len(items) - FEW} more" if len(items) > FEW else ""
     return f"{joint.join(items[:FEW])}{more}"
+
+
+def has_display() -> bool:
+    """Whether windows can be opened."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -15,7 +15,9 @@ from stages.messages import (
     Arrangement,
     Asked,
     Assertion,
+    Forget,
     Goal,
+    Look,
     LookRequest,
     Observation,
     Outcome,
@@ -23,6 +25,7 @@ from stages.messages import (
     Restore,
     RobotState,
     SceneGraph,
+    Stop,
     Task,
     Teach,
     Transfer,
@@ -30,6 +33,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.scene import SceneObject
+from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
@@ -80,6 +84,8 @@ class State:
     """Key of every transfer that failed or missed its relation, in order."""
     complaint: str = ""
     """Why the newest transfer failed; empty where it reached its relation."""
+    stopping: bool = False
+    """Somebody asked to stop: what is waited for is the last."""
 
 
 class Demonstrator(Stage):
@@ -148,12 +154,29 @@ class Demonstrator(Stage):
 
     def on_restore(self, restore: Restore, ctx: Context) -> LookRequest:
         """Looks at what there is to do for a goal."""
-        goals = self._state.goals
-        if restore.name not in goals:
-            raise Refused(f"name={restore.name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
-        self._begin(restore.name, goals[restore.name])
+        self._begin(restore.name, self._goal(restore.name))
         ctx.log(f'restores the goal "{restore.name}"')
         return self._look(f"restore {restore.name}")
+
+    def on_forget(self, forget: Forget, ctx: Context) -> None:
+        """Strikes a goal off; one that is being restored still is."""
+        self._goal(forget.name)
+        goals = {name: goal for name, goal in self._state.goals.items() if name != forget.name}
+        self._state = replace(self._state, goals=goals)
+        ctx.log(f'goal "{forget.name}" forgotten')
+
+    def on_look(self, look: Look, ctx: Context) -> LookRequest:
+        """Looks without a goal."""
+        self._begin("", None)
+        ctx.log("looks at what is there")
+        return self._look("look")
+
+    def on_stop(self, stop: Stop, ctx: Context) -> None:
+        """Lets what is under way come to its end, and nothing follow it."""
+        if self._state.phase in (Phase.IDLE, Phase.DONE):
+            raise Refused("nothing is under way")
+        self._state = replace(self._state, stopping=True)
+        ctx.log(f"stops after {self._state.phase.value}")
 
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
         """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
@@ -164,6 +187,12 @@ class Demonstrator(Stage):
     ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict]:
         """Remembers the goal, or compares the scene with it and asks for a plan where they differ."""
         if self._state.phase is not Phase.LOOKING:
+            return
+        if self._state.stopping:
+            yield self._stopped(ctx)
+            return
+        if not self._state.goal_name:
+            self._state = replace(self._state, phase=Phase.IDLE)
             return
         scene = self._memory.complete(scene_graph, self._state.known, observation)
         self._state = replace(
@@ -185,6 +214,8 @@ class Demonstrator(Stage):
         """Starts the plan's first transfer, or gives up where there is none."""
         if self._state.phase is not Phase.PLANNING:
             return None
+        if self._state.stopping:
+            return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
         if plan.status == "solved":
             return self._proceed(plan, ctx)
@@ -194,7 +225,7 @@ class Demonstrator(Stage):
             return self._look_again("executor", f"{self._state.complaint}; no other way: {plan.reason}", ctx)
         return self._look_again("planner", plan.reason, ctx)
 
-    def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | None:
+    def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
         """Looks at what the transfer did, whether it claims success or not."""
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
             return None
@@ -204,8 +235,16 @@ class Demonstrator(Stage):
             f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
             level="info" if outcome.success else "warning",
         )
+        if self._state.stopping:
+            return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
+
+    def _goal(self, name: str) -> SceneGraph:
+        goals = self._state.goals
+        if name not in goals:
+            raise Refused(f"name={name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
+        return goals[name]
 
     def _begin(self, name: str, goal: SceneGraph | None) -> None:
         """Starts from anew with a goal, or with one that is yet to be seen."""
@@ -302,6 +341,10 @@ class Demonstrator(Stage):
     def _fail(self, stage: str, reason: str, ctx: Context) -> Verdict:
         ctx.log(f"giving up: {reason}", level="error")
         return self._conclude(stage, reason, ctx)
+
+    def _stopped(self, ctx: Context) -> Verdict:
+        ctx.log("stopped, as asked")
+        return self._conclude(STOPPED, "stopped, as asked", ctx)
 
     def _conclude(self, failed_stage: str, reason: str, ctx: Context) -> Verdict:
         state = self._state

@@ -73,7 +73,7 @@ class Ros2Scenes(Stage):
 
     def on_look(self, look: Look, ctx: Context) -> LookRequest:
         """Takes a look."""
-        return self._look(look.purpose)
+        return self._look("called")
 
     def on_scene_graph(
         self, frame: Frame, scene_estimate: SceneEstimate, scene_graph: SceneGraph, ctx: Context

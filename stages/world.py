@@ -12,7 +12,7 @@ from runner.contract import Context, Refused, Stage
 from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
 from stages.geometry.poses import pose
-from stages.messages import Arrange, Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.messages import Arrange, Arrangement, LookRequest, Move, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01
@@ -56,6 +56,14 @@ class World(Stage):
         if arrange.draw < 0:
             raise Refused(f"draw={arrange.draw} is negative; choose 0, 1, 2, ...")
         self._lay_out(arrange.kind, (arrange.draw,) if arrange.draw else (), ctx)
+
+    def on_move(self, move: Move, ctx: Context) -> None:
+        """Puts one object elsewhere when somebody asks for it, whatever the robot is doing."""
+        layout = dict(zip(self._simulation.names, self._simulation.object_poses(), strict=True))
+        if move.name not in layout:
+            raise Refused(f"name={move.name!r}: no such object; valid: {', '.join(layout)}")
+        self._simulation.place(move.name, tabletop.moved(move.name, move.x, move.y, layout, self._catalogue))
+        ctx.log(f"{move.name} moved to {move.x:.2f}, {move.y:.2f}")
 
     def on_look_request(self, look_request: LookRequest) -> Snapshot:
         """The world as it is now, for the simulated camera."""

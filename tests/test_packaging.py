@@ -105,13 +105,12 @@ def key(name: str) -> str:
 
 
 def test_what_the_runner_imports_is_installed_with_it():
-    assert (
-        undeclared("runner", *PROJECT["dependencies"], *EXTRAS["view"], *EXTRAS["foxglove"], *EXTRAS["ros2"]) == set()
-    )
+    extras = (name for extra in ("view", "page", "foxglove", "ros2") for name in EXTRAS[extra])
+    assert undeclared("runner", *PROJECT["dependencies"], *extras) == set()
 
 
-def test_only_views_import_what_their_extras_bring():
-    others = [path for path in (ROOT / "runner").iterdir() if path.is_dir() and path.name != "view"]
+def test_only_views_and_pages_import_what_their_extras_bring():
+    others = [path for path in (ROOT / "runner").iterdir() if path.is_dir() and path.name not in ("view", "page")]
     assert {folder.name: undeclared(f"runner/{folder.name}", *PROJECT["dependencies"]) for folder in others} == {
         folder.name: set() for folder in others
     }
@@ -123,7 +122,10 @@ def test_what_stages_import_is_installed_with_their_extra():
 
 def test_every_requirement_has_its_tested_version():
     pinned = {key(line.partition("==")[0]) for line in (ROOT / "constraints.txt").read_text().splitlines()}
-    required = [*PROJECT["dependencies"], *(name for extra in ("stages", "view", "dev") for name in EXTRAS[extra])]
+    required = [
+        *PROJECT["dependencies"],
+        *(name for extra in ("stages", "view", "page", "dev") for name in EXTRAS[extra]),
+    ]
     assert {name for name in required if key(name.partition("[")[0]) not in pinned} == set()
 
 

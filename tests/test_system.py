@@ -100,7 +100,7 @@ def modules() -> list[Module]:
 def test_every_program_that_is_looked_for_is_installed_or_accounted_for():
     found = {word for module in modules() for word in module.programs()}
     named = {word for word in found if not word.startswith("?")}
-    assert named >= {"git", "ip", "Xvfb"}
+    assert named >= {"chromium", "git", "ip", "Xvfb"}
     assert named - EVERYWHERE - ELSEWHERE.keys() - installed().keys() == set()
     assert {word[1:] for word in found - named} - OURS - HANDED_ON.keys() == set()
 
@@ -121,7 +121,7 @@ def test_nothing_is_called_where_all_is_there(tmp_path: Path):
 
 @pytest.fixture
 def bare(tmp_path: Path) -> Path:
-    """A folder of programs without Xvfb and git."""
+    """A folder of programs without Xvfb, chromium and git."""
     for program in (shutil.which("cat"), shutil.which("find"), shutil.which("env")):
         assert program is not None
         (tmp_path / Path(program).name).symlink_to(program)
@@ -132,10 +132,10 @@ def test_root_installs_what_is_missing(bare: Path):
     calls = stub(bare, "apt-get")
     stub(bare, "id", "echo 0")
     done = run(str(bare))
-    assert (done.returncode, done.stdout, done.stderr) == (0, "Installing xvfb git\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "Installing xvfb chromium git\n", "")
     update, install = calls.read_text().splitlines()
     assert update == "update -qq"
-    assert install == "install --yes --no-install-recommends xvfb git -qq"
+    assert install == "install --yes --no-install-recommends xvfb chromium git -qq"
 
 
 def test_others_install_with_sudo_or_are_told_what_to_type(bare: Path):
@@ -143,7 +143,7 @@ def test_others_install_with_sudo_or_are_told_what_to_type(bare: Path):
     stub(bare, "id", "echo 1000")
     done = run(str(bare))
     assert (done.returncode, calls.exists()) == (1, False)
-    command = "apt-get install --yes --no-install-recommends xvfb git"
+    command = "apt-get install --yes --no-install-recommends xvfb chromium git"
     assert f"    sudo apt-get update && sudo {command}\n" in done.stderr
     stub(bare, "sudo", '[ "$1" = -n ] || "$@"')
     assert run(str(bare)).returncode == 0
@@ -153,7 +153,7 @@ def test_others_install_with_sudo_or_are_told_what_to_type(bare: Path):
 def test_without_debians_package_manager_the_packages_are_named(bare: Path):
     done = run(str(bare))
     assert done.returncode == 1
-    assert done.stderr.startswith("Missing: xvfb git (Debian's names)")
+    assert done.stderr.startswith("Missing: xvfb chromium git (Debian's names)")
 
 
 def stub(folder: Path, name: str, script: str = "") -> Path:

@@ -109,6 +109,10 @@ class GraphKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     name: Annotated[str, Meta(pattern=r"^[\w-]+$(?!\n)", description="Names the recordings")]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
     view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
+    story: Annotated[
+        str | None, Meta(description="module:Class that tells people on a page what happens and what they can do")
+    ] = None
+    page: Annotated[bool, Meta(description="Serve a page on every run, as `runner up --page` does")] = False
     listen: Annotated[
         str | None, Meta(description="Where others may listen, for example tcp/127.0.0.1:7447; only this user without")
     ] = None

@@ -115,7 +115,7 @@ def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> 
     seen: set[str] = set()
     for line in lines:
         seen.add(line.stage)
-        if stage in (None, line.stage) and line.level != "debug":
+        if stage in (None, line.stage):
             began = began or line.time_ns
             name = f"{line.stage}.{line.replica}" if line.replica else line.stage
             terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)

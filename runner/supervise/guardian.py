@@ -210,7 +210,8 @@ class Guardian:
             awaited = self.awaited()
             self._ready[process] = time.monotonic() - self._started[process]
             if process.stage != RECORDER:
-                self._terminal.show(self._run.name_of(process), f"ready after {self._ready[process]:.1f} s")
+                level: Level = "debug" if awaited else "info"  # it is one of many that start, or replaces one
+                self._terminal.show(self._run.name_of(process), f"ready after {self._ready[process]:.1f} s", level)
             if awaited and not self.awaited():
                 self._terminal.show(SUPERVISOR, f"all {len(self._graph.processes())} processes are ready")
 

@@ -109,13 +109,19 @@ class Supervisor:
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
 
+    @property
+    def id(self) -> str:
+        """Of the run."""
+        return self._run.id
+
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
         self._connect()
-        self._terminal.show(SUPERVISOR, f"run {self._run.id} on {self._graph.listen or self._run.gateway}")
+        where = f"run {self._run.id} on {self._graph.listen or self._run.gateway}"
+        self._terminal.show(SUPERVISOR, f"{where} starts {len(self._graph.processes())} processes")
         try:
             self._guardian.start_recorder(view=view)
             if self._hosts is not None:
@@ -176,7 +182,7 @@ class Supervisor:
 
     def _on_log(self, line: LogLine, _: Packet) -> None:
         self._calls.note_log(line)
-        if line.stage != SUPERVISOR and line.level != "debug":
+        if line.stage != SUPERVISOR:
             self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
 
     def _on_finished(self, envelope: Envelope, packet: Packet) -> None:

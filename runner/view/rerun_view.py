@@ -10,7 +10,6 @@ import os
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -26,6 +25,7 @@ from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
 from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
 from runner.recording.recording import RUN, Recording, payload_kind
+from runner.terminal import has_display
 from runner.view.canvas import Canvas
 from runner.view.views import drawn, load_views
 
@@ -129,8 +129,7 @@ def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool
 def _start_viewer(port: int, *arguments: str) -> subprocess.Popen[bytes]:
     """A window where there is a display, a page on loopback elsewhere; takes drawings on ``port``."""
     command = [RERUN, "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, *arguments]
-    display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if not display:
+    if not has_display():
         web = _free_port()
         command += ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", MEMORY]
         source = quote(f"rerun+http://127.0.0.1:{port}/proxy", safe="")

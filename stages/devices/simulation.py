@@ -59,9 +59,18 @@ class Simulation:
         self._data.time = now
         self._go_home()
         for name, T in layout.items():
-            position = T[:3, 3] + [0, 0, _DROP]
-            self._data.joint(name).qpos[:] = np.concatenate([position, quaternion(T[:3, :3])])
+            self._put(name, T)
         self.run(settle)
+
+    def place(self, name: str, T_base_object: Floats, *, settle: float = 1.0) -> None:
+        """Puts one object down just above a pose (4 x 4), then lets physics settle."""
+        self._put(name, T_base_object)
+        self.run(settle)
+
+    def _put(self, name: str, T_base_object: Floats) -> None:
+        joint = self._data.joint(name)
+        joint.qpos[:] = np.concatenate([T_base_object[:3, 3] + [0, 0, _DROP], quaternion(T_base_object[:3, :3])])
+        joint.qvel[:] = 0
 
     def run(self, seconds: float) -> None:
         """Lets time pass."""

@@ -143,6 +143,32 @@ def support_height(entry: CatalogueObject, x: float, y: float) -> float:
     return max(tops, default=float(entry.bounds[1, 2]))
 
 
+def moved(name: str, x: float, y: float, layout: Layout, catalogue: Catalogue) -> Floats:
+    """T_base_object of an object that is put down upright at (x, y), on whatever is highest below it.
+
+    Raises Refused where there is no table below.
+    """
+    low, high = (np.array(TABLE.center) + sign * np.array(TABLE.size) / 2 for sign in (-1, 1))
+    if not ((low < [x, y]) & ([x, y] < high)).all():
+        raise Refused(
+            f"x={x:g} y={y:g}: beside the table; valid: {low[0]:g} to {high[0]:g} and {low[1]:g} to {high[1]:g}"
+        )
+    entry, others = catalogue[name], {other: T for other, T in layout.items() if other != name}
+    corners = (np.array([*np.ndindex(3, 3)]) - 1) * entry.dimensions[:2] / 2
+    height = max(_height_over(x + dx, y + dy, others, catalogue) for dx, dy in corners.tolist())
+    yaw = np.arctan2(layout[name][1, 0], layout[name][0, 0])
+    return _standing(entry, x, y, yaw, height)
+
+
+def _height_over(x: float, y: float, layout: Layout, catalogue: Catalogue) -> float:
+    """Height of the highest surface at (x, y) in the base frame, metres."""
+    tops = [TABLE.height]
+    for name, T in layout.items():
+        local = inverse(T) @ [x, y, 0, 1]
+        tops += [T[2, 3] + _top(one) for one in catalogue[name].collision if _covers(one, local[0], local[1])]
+    return float(max(tops))
+
+
 def _scatter(names: list[str], goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout | None:
     """Places one object after the other where it keeps its distance; None where the table is too full."""
     layout: Layout = {}

@@ -9,16 +9,20 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
 from stages.messages.robot import RobotCommand, RobotState
-from stages.messages.ros2 import Asked, Look, Ros2Message, Ros2Sent
+from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, Snapshot
 from stages.messages.task import (
     Arrange,
     Arrangement,
+    Forget,
     Goal,
+    Look,
+    Move,
     Outcome,
     Plan,
     Restore,
+    Stop,
     Task,
     Teach,
     Transfer,
@@ -35,6 +39,7 @@ __all__ = [
     "Candidate",
     "Candidates",
     "Depth",
+    "Forget",
     "Frame",
     "Goal",
     "Hypothesis",
@@ -42,6 +47,7 @@ __all__ = [
     "Look",
     "LookRequest",
     "Mask",
+    "Move",
     "ObjectPose",
     "Observation",
     "Outcome",
@@ -59,6 +65,7 @@ __all__ = [
     "SceneEstimate",
     "SceneGraph",
     "Snapshot",
+    "Stop",
     "Task",
     "Teach",
     "Transfer",

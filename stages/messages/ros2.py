@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.contract import Command, Message, Spec, Struct
+from runner.contract import Message, Spec, Struct
 
 Bytes = Annotated[NDArray[np.uint8], Spec("uint8", ("N",))]
 
@@ -33,10 +33,3 @@ class Asked(Message, frozen=True, kw_only=True):
     kind: Literal["teach", "restore"]
     name: str
     """Of the goal."""
-
-
-class Look(Command, frozen=True, kw_only=True):
-    """Takes a look, whose scene is published."""
-
-    purpose: str = "look"
-    """Shown to people."""

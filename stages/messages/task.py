@@ -8,6 +8,9 @@ from stages.messages.scene import Assertion, SceneGraph
 
 FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release"]
 
+STOPPED = "stop"
+"""Stands where a verdict names the stage that failed: somebody asked to stop."""
+
 
 class Arrangement(Message, frozen=True, kw_only=True):
     """Asks the person (scripted, in simulation) to lay out a scene."""
@@ -99,6 +102,7 @@ class Verdict(Message, frozen=True, kw_only=True):
     goal_name: str
     success: bool
     failed_stage: str
+    """Empty for a success, :data:`STOPPED` where somebody asked for the end."""
     reason: str
     satisfied: tuple[Assertion, ...]
     violated: tuple[Assertion, ...]
@@ -126,6 +130,23 @@ class Restore(Command, frozen=True, kw_only=True):
     """Of a goal that was taught."""
 
 
+class Forget(Command, frozen=True, kw_only=True):
+    """Forgets the goal of that name."""
+
+    name: str
+    """Of a goal that was taught."""
+
+
+class Look(Command, frozen=True, kw_only=True):
+    """Takes a look, for whoever wants to know what is there now; nothing is remembered."""
+
+
+class Stop(Command, frozen=True, kw_only=True):
+    """Ends what is under way: the robot first puts down what it holds, and begins nothing more."""
+
+    answers = (Verdict,)
+
+
 class Arrange(Command, frozen=True, kw_only=True):
     """Lays the objects of the simulated world out, as a person would."""
 
@@ -133,3 +154,13 @@ class Arrange(Command, frozen=True, kw_only=True):
     """The scene to be shown, or a disturbed one."""
     draw: int = 0
     """Each number draws another scene of that kind."""
+
+
+class Move(Command, frozen=True, kw_only=True):
+    """Puts an object of the simulated world elsewhere, as a person would."""
+
+    name: str
+    x: float
+    """Metres in front of the robot's base."""
+    y: float
+    """Metres to its left."""

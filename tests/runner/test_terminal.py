@@ -29,6 +29,13 @@ def test_colours_are_for_who_wants_to_see_them(
     assert stream.getvalue() == text
 
 
+def test_what_is_for_debugging_is_shown_on_request():
+    stream = io.StringIO()
+    for verbose in (False, True):
+        Terminal(stream, verbose=verbose).show("camera", "ready", "debug", seconds=0.0)
+    assert stream.getvalue() == "    0.0 s  camera           ready\n"
+
+
 def test_what_is_said_cannot_steer_the_terminal():
     stream = io.StringIO()
     Terminal(stream).show("camera", "a\033[2Jb\nc", seconds=0.0)

@@ -12,18 +12,22 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
     Arrangement,
+    Forget,
     Goal,
+    Look,
     LookRequest,
     Observation,
     Restore,
     RobotState,
     SceneGraph,
+    Stop,
     Task,
     Teach,
     Transfer,
     TransferRequest,
     Verdict,
 )
+from stages.messages.task import STOPPED
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout
 from tests.stages.perception.scenes import K, camera, render, upright
@@ -82,9 +86,9 @@ class Episode:
         ending = msgspec.structs.replace(outcome(number, item, **fields), T_base_object=at)
         return self.take(self.stage.on_outcome(ending, self.ctx))
 
-    def called(self, command: Teach | Restore) -> list[Message]:
-        handler = self.stage.on_teach if isinstance(command, Teach) else self.stage.on_restore
-        return self.take(handler(command, self.ctx))  # type: ignore[arg-type]
+    def called(self, command: Teach | Restore | Forget | Look | Stop) -> list[Message]:
+        handler = getattr(self.stage, f"on_{type(command).__name__.lower()}")
+        return self.take(handler(command, self.ctx))
 
     def until_task(self, goal: SceneGraph = GOAL, start: SceneGraph = START) -> Task:
         """Everything up to the first request for a plan."""
@@ -346,6 +350,51 @@ def test_a_goal_that_cannot_be_seen_is_a_verdict_and_the_next_command_works() ->
     episode.called(Teach(name="tea"))
     assert the_verdict(episode.seen(GOAL)).failed_stage == "perception"
     assert episode.called(Teach(name="tea")) == [LookRequest(purpose="goal tea")]
+
+
+def test_a_look_remembers_nothing_and_the_next_command_works() -> None:
+    episode = Episode(scripted=False)
+    assert episode.called(Look()) == [LookRequest(purpose="look")]
+    with pytest.raises(Refused, match="busy: waits for a scene graph"):
+        episode.called(Look())
+    assert episode.seen(GOAL) == []
+    assert episode.called(Teach(name="tea")) == [LookRequest(purpose="goal tea")]
+
+
+def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -> None:
+    episode = Episode(scripted=False)
+    with pytest.raises(Refused, match="nothing is under way"):
+        episode.called(Stop())
+
+    def stopped(messages: list[Message]) -> None:
+        verdict = the_verdict(messages)
+        assert (verdict.success, verdict.failed_stage, verdict.reason) == (False, STOPPED, "stopped, as asked")
+
+    episode.called(Teach(name="tea"))
+    assert episode.called(Stop()) == []
+    stopped(episode.seen(GOAL))
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    for until in ("plan", "outcome"):
+        episode.called(Restore(name="tea"))
+        episode.seen(START)
+        if until == "outcome":
+            episode.planned(STEP)
+        assert episode.called(Stop()) == []
+        stopped(episode.planned(STEP) if until == "plan" else episode.ended(1, STEP))
+        assert episode.seen(GOAL) == []
+
+
+def test_a_goal_that_is_forgotten_cannot_be_restored() -> None:
+    episode = Episode(scripted=False)
+    for name in ("tea", "mess"):
+        episode.called(Teach(name=name))
+        episode.seen(GOAL)
+    assert episode.called(Forget(name="tea")) == []
+    for command in (Restore(name="tea"), Forget(name="tea")):
+        with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
+            episode.called(command)
+    assert episode.called(Restore(name="mess")) == [LookRequest(purpose="restore mess")]
 
 
 def test_commands_at_the_wrong_time_are_refused() -> None:

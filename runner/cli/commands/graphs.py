@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import json
 from typing import TYPE_CHECKING
@@ -22,9 +23,14 @@ def add_commands(commands: Commands) -> None:
     where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
     add_recordings(up, "where recordings go")
+    up.add_argument(
+        "--verbose", action="store_true", help="say when each process is ready, and what stages say for debugging"
+    )
     seen = up.add_mutually_exclusive_group()
     seen.add_argument("--view", action="store_true", help="open the viewer")
     seen.add_argument("--steps-only", action="store_true", help="record no messages: nothing can be replayed")
+    text = "serve a page for people who do not program; only this machine can open it"
+    up.add_argument("--page", action="store_true", help=text)
     add_graph(add(commands, "check", _check, "check a graph file: keys, settings, classes and every edge's type"))
     add_graph(add(commands, "graph", _graph, "print a graph as a Mermaid flow chart"))
     add(commands, "schema", _schema, "print the JSON Schema of graph files")
@@ -52,13 +58,16 @@ def _up(options: argparse.Namespace) -> int:
 def _supervise(options: argparse.Namespace) -> int:
     """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
     from runner.graph.graph import SUPERVISOR, load_graph
+    from runner.page.start import page_beside, require_page
     from runner.process.fork_server import ForkServer
     from runner.supervise.supervisor import Supervisor
     from runner.terminal import Terminal
 
-    terminal = Terminal()
+    terminal = Terminal(verbose=options.verbose)
     gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, options.settings)
+    if options.page or graph.page:
+        require_page()
     forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
         graph.here() if options.here else graph,
@@ -69,7 +78,8 @@ def _supervise(options: argparse.Namespace) -> int:
         forks=forks,
         steps_only=options.steps_only,
     )
-    end = supervisor.run(view=options.view)
+    with page_beside(supervisor.id) if options.page or graph.page else contextlib.nullcontext():
+        end = supervisor.run(view=options.view)
     terminal.plain(end.reason)
     return end.code
 
@@ -91,7 +101,7 @@ def _take_part(options: argparse.Namespace, document: Document, host: str) -> in
 
     refuse_settings(options.settings, host)
     become_clean("runner.cli", *options.arguments)
-    terminal = Terminal()
+    terminal = Terminal(verbose=options.verbose)
     forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
     end = Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
     terminal.plain(end.reason)

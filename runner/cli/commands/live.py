@@ -1,8 +1,10 @@
-"""Commands on graphs that run: ``ps``, ``logs``, ``topic``, ``call``, ``restart``, ``down``."""
+"""Commands on graphs that run: ``ps``, ``logs``, ``topic``, ``call``, ``restart``, ``goals``, ``page``, ``down``."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +43,17 @@ def add_commands(commands: Commands) -> None:
     restart = add(commands, "restart", _restart, "replace a process in order: it finishes its step, nothing is lost")
     completed(restart.add_argument("process", metavar="STAGE[.REPLICA]"), completion.processes)
     _add_run(restart)
+
+    goals = add(commands, "goals", _goals, "show what the running graph was taught, and what can be done with it")
+    goals.add_argument("name", metavar="NAME", nargs="?", help="only this one")
+    _add_run(goals)
+
+    page = add(commands, "page", _page, "serve a page on the running graph, for people who do not program")
+    page.add_argument(
+        "--address", default="127.0.0.1", help="where it is; beyond this machine RUNNER_PAGE_TOKEN must be set"
+    )
+    page.add_argument("--port", type=int, default=0, help="any that is free by default")
+    _add_run(page)
 
     _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
 
@@ -143,6 +156,38 @@ def _field(text: str) -> tuple[str, str]:
 def _restart(options: argparse.Namespace) -> None:
     with _reached(options) as live:
         print(live.restart(options.process))
+
+
+def _goals(options: argparse.Namespace) -> None:
+    from runner.graph.document import suggest
+    from runner.page.watch import told_so_far
+    from runner.supervise.registry import find_run
+
+    told = told_so_far(Path(find_run(options.run).recording), "en")
+    titles = [card.title for card in told.cards]
+    if options.name is not None and options.name not in titles:
+        raise Refused(f"{options.name}: is not remembered{suggest(options.name, titles)}")
+    for card in told.cards:
+        if options.name in (None, card.title):
+            calls = (f"runner call {one.stage} {one.command} {_typed(one.arguments)}" for one in card.actions)
+            print(card.title, *(f"    {line}" for line in (card.text, *calls)), sep="\n")
+    if not told.cards:
+        print(told.cards_hint or "this graph remembers nothing")
+
+
+def _typed(arguments: dict[str, str]) -> str:
+    return " ".join(f"{name}={shlex.quote(value)}" for name, value in arguments.items())
+
+
+def _page(options: argparse.Namespace) -> None:
+    from runner.page.start import require_page
+    from runner.supervise.registry import find_run
+
+    require_page()
+    from runner.page.server import serve
+
+    token = os.environ.pop("RUNNER_PAGE_TOKEN", "")
+    serve(find_run(options.run), address=options.address, port=options.port, token=token)
 
 
 def _down(options: argparse.Namespace) -> None:

@@ -113,7 +113,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_a_process_may_be_there_before_who_started_it_goes_on(tmp_path: Path):
-    command = [sys.executable, "-c", SEEN_FIRST, "up", str(DOUBLES), "--recordings", str(tmp_path)]
+    command = [sys.executable, "-c", SEEN_FIRST, "up", str(DOUBLES), "--verbose", "--recordings", str(tmp_path)]
     command += ["--set", f"sink.path={tmp_path / 'out.txt'}", "--set", "doubler.die_at=2"]
     done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -252,7 +252,7 @@ def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
 
 def test_a_dying_terminal_ends_the_graph_in_order(tmp_path: Path):
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "runner.cli", "up", str(DOUBLES), "--recordings", str(tmp_path)]
+    command = [sys.executable, "-m", "runner.cli", "up", str(DOUBLES), "--verbose", "--recordings", str(tmp_path)]
     command += [part for setting in (f"sink.path={tmp_path / 'out.txt'}", *ENDLESS) for part in ("--set", setting)]
     script = "import fcntl, os, signal, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
     script += "signal.signal(signal.SIGHUP, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"

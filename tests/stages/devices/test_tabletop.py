@@ -8,7 +8,7 @@ from stages.devices import tabletop
 from stages.devices.simulation import Simulation
 from stages.devices.tabletop import GOALS, Layout, sample_goal, sample_start, support_height
 from stages.scene.catalogue import Catalogue
-from tests.stages.planning.scenes import catalogue
+from tests.stages.planning.scenes import catalogue, standing
 
 Sampler = Callable[[str, Catalogue, np.random.Generator], Layout]
 
@@ -59,3 +59,18 @@ def test_support_heights() -> None:
     assert support_height(tray, 0.0, 0.0) == pytest.approx(-0.009)
     assert support_height(tray, 0.195, 0.0) == pytest.approx(0.015)
     assert support_height(box, 0.0, 0.0) == pytest.approx(0.040)
+
+
+def test_what_is_moved_is_put_down_on_what_is_below_and_never_beside_the_table() -> None:
+    objects = catalogue()
+    simulation = Simulation(objects, ("tea_box", "tuna_can"))
+    simulation.arrange({"tea_box": standing("tea_box", 0.6, 0.1), "tuna_can": standing("tuna_can", 0.6, -0.2)})
+    for x, y, below in ((0.6, 0.1, objects["tea_box"].dimensions[2]), (0.7, -0.1, 0.0)):
+        layout = dict(zip(simulation.names, simulation.object_poses(), strict=True))
+        simulation.place("tuna_can", tabletop.moved("tuna_can", x, y, layout, objects))
+        can = simulation.object_poses()[1]
+        bottom = can[2, 3] + objects["tuna_can"].bounds[0, 2]
+        assert np.allclose([*can[:2, 3], bottom], [x, y, tabletop.TABLE.height + below], atol=0.004)
+        assert can[2, 2] > 0.999
+    with pytest.raises(Refused, match=r"x=0\.2 y=0: beside the table; valid: 0\.45 to 1\.15 and -0\.6 to 0\.6"):
+        tabletop.moved("tuna_can", 0.2, 0.0, layout, objects)

@@ -1,0 +1,52 @@
+"""The recordings beside that of a run: when each was made, how long it lasted, whether it is whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from runner.recording.container import is_being_written
+from runner.recording.recording import RUN, VERDICT
+
+
+class PastRun(msgspec.Struct, frozen=True):
+    """What the beginning and the end of a recording say."""
+
+    name: str
+    """Of the file, without ``.mcap``."""
+    graph: str
+    started: float
+    """Seconds since the epoch."""
+    seconds: float
+    bytes: int
+    verdict: str
+    """COMPLETE, INCOMPLETE, or empty where it is still being written or its end is missing."""
+    running: bool
+
+
+def past_runs(folder: Path) -> list[PastRun]:
+    """Every recording in a folder that can be read, the newest first."""
+    found = filter(None, map(_read, folder.glob("*.mcap")))
+    return sorted(found, key=lambda run: run.started, reverse=True)
+
+
+def _read(path: Path) -> PastRun | None:
+    try:
+        with path.open("rb") as file:
+            size, modified = path.stat().st_size, path.stat().st_mtime
+            if is_being_written(file):
+                return PastRun(path.stem, "", modified, 0.0, size, "", True)
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            said = {record.name: record.metadata for record in reader.iter_metadata()}
+    except (McapError, OSError, ValueError):
+        return None
+    statistics = summary.statistics if summary else None
+    start, end = (statistics.message_start_time, statistics.message_end_time) if statistics else (0, 0)
+    verdict = said.get(VERDICT, {}).get("verdict", "")
+    return PastRun(
+        path.stem, said.get(RUN, {}).get("name", ""), start * 1e-9, (end - start) * 1e-9, size, verdict, False
+    )

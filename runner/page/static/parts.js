@@ -1,0 +1,44 @@
+// What several views show alike.
+
+import {html, nothing} from "./lit-html.js";
+
+/** A button for an action; where it asks for something, a small form. Beside it stands why it was refused. */
+export function button(page, action, {shortcut} = {}) {
+  const reason = page.refused[`${action.stage}.${action.command}`];
+  const kind = action.kind === "plain" ? "" : action.kind;
+  const send = (event) => {
+    event.preventDefault();
+    if (action.confirm && !confirm(action.confirm)) return;
+    const args = {...action.arguments};
+    if (action.ask) args[action.ask.field] = new FormData(event.target).get("asked");
+    page.call(action.stage, action.command, args);
+    if (action.ask) event.target.reset();
+  };
+  return html`<form class="action ${kind}" @submit=${send}>
+    ${action.ask ? field(action) : nothing}
+    <button class=${kind} ?disabled=${!action.now || !page.connected}
+      aria-keyshortcuts=${shortcut ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
+      >${action.label}</button>
+    ${reason ? html`<p class="refused" role="alert">${page.say("refused")} ${reason}</p>` : nothing}
+  </form>`;
+}
+
+function field({ask, command}) {
+  const hint = `${command}-hint`;
+  return html`<label>${ask.label}
+      <input name="asked" required autocomplete="off" maxlength="60" pattern=${ask.pattern || nothing}
+        title=${ask.hint || nothing} aria-describedby=${ask.hint ? hint : nothing}></label>
+    ${ask.hint ? html`<p class="hint" id=${hint}>${ask.hint}</p>` : nothing}`;
+}
+
+/** A duration as people say it: 8 s, 1 min 5 s. */
+export function lasted(seconds) {
+  const whole = Math.max(0, Math.round(seconds));
+  return whole < 60 ? `${whole} s` : `${Math.floor(whole / 60)} min ${whole % 60} s`;
+}
+
+/** A number of bytes: 15.5 MB. */
+export function size(bytes) {
+  const power = Math.min(3, Math.max(0, Math.floor(Math.log10(Math.max(1, bytes)) / 3)));
+  return `${(bytes / 1000 ** power).toFixed(power ? 1 : 0)} ${["B", "kB", "MB", "GB"][power]}`;
+}

@@ -1,0 +1,106 @@
+// For the person who shows the scene: what is seen, what goes on, what can be done.
+
+import {html, nothing, svg} from "./lit-html.js";
+import {map} from "./map.js";
+import {button, lasted} from "./parts.js";
+
+const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
+const SIGNS = {sure: "✓", unsure: "?", doubtful: "!", unknown: "?"};
+
+export function scene(page) {
+  const told = page.told;
+  if (!told) return html`<p class="quiet">${page.say("waiting")}</p>`;
+  const offered = told.actions.filter((action) => action.kind !== "stop");
+  return html`<div class="scene">
+    <div class="seen">${view(page, told.view)}</div>
+    <div class="said">
+      ${doing(page, told)}
+      ${offered.length ? html`<section aria-labelledby="do"><h2 id="do">${page.say("do")}</h2>
+        ${offered.map((action) => button(page, action))}</section>` : nothing}
+    </div>
+    ${statements(page, told)}
+    ${told.map ? map(page, told.map) : nothing}
+    ${told.cards_title ? cards(page, told) : nothing}
+  </div>`;
+}
+
+function view(page, view) {
+  if (!view) return html`<div class="picture empty"><p>${page.say("nothing_seen")}</p></div>`;
+  const [height, width] = view.photo.rgb;
+  return html`<figure>
+    <div class="picture" style="aspect-ratio: ${width} / ${height}">
+      <img src="photo/${view.photo.key}.jpg" width=${width} height=${height} alt=${view.caption}>
+      <svg viewBox="0 0 ${width} ${height}" aria-hidden="true">
+        ${view.outlines.map((one) => svg`<path class="${one.surety} ${one.name === page.marked ? "marked" : ""}"
+          d="M${one.points.map((point) => point.join(" ")).join("L")}Z"/>`)}
+      </svg>
+      ${labels(view.outlines).map(([one, x, y]) => html`<span
+        class="name ${one.surety} ${one.name === page.marked ? "marked" : ""}"
+        style="left: ${(100 * x) / width}%; top: ${(100 * y) / height}%"
+        ><b aria-hidden="true">${SIGNS[one.surety]}</b> ${one.label}</span>`)}
+    </div>
+    <figcaption>${view.caption}</figcaption>
+  </figure>`;
+}
+
+/** Where each name stands, its middle in pixels of the picture: over its outline, under it where other names are. */
+function labels(outlines) {
+  const placed = [];
+  const free = ([, x, y, wide]) => placed.every((one) => 2 * Math.abs(x - one[1]) > wide + one[3] || Math.abs(y - one[2]) > TALL);
+  for (const one of outlines.toReversed()) {
+    const xs = one.points.map(([x]) => x), ys = one.points.map(([, y]) => y);
+    const x = (Math.min(...xs) + Math.max(...xs)) / 2, wide = WIDE * (one.label.length + 3);
+    const places = [Math.min(...ys) - TALL / 2, Math.max(...ys) + TALL / 2, Math.min(...ys) - 1.5 * TALL];
+    const spots = places.map((y) => [one, x, Math.max(y, TALL / 2), wide]);
+    placed.push(spots.find(free) ?? spots[0]);
+  }
+  return placed;
+}
+
+function statements(page, told) {
+  if (!told.statements.length) return nothing;
+  const mark = (name) => () => { page.marked = name; page.draw(); };
+  return html`<section class="there" aria-labelledby="there"><h2 id="there">${page.say("there")}</h2>
+    <ul class="statements">${told.statements.map((one) => html`
+      <li @mouseenter=${mark(one.about)} @mouseleave=${mark("")}>
+        <span>${one.text}</span>
+        ${one.how_sure ? html`<span class="sure ${one.surety}"><b aria-hidden="true">${SIGNS[one.surety]}</b>
+          ${one.how_sure}</span>` : nothing}
+      </li>`)}</ul></section>`;
+}
+
+function doing(page, told) {
+  const {text, busy, step, steps, since_ns} = told.doing;
+  return html`<section class="doing ${busy ? "busy" : ""}" aria-labelledby="now">
+    <h2 id="now">${page.say("now")}</h2>
+    <p class="what" role="status">${text}</p>
+    ${steps.length ? html`<progress max=${steps.length} value=${step - 1} aria-label=${page.say("progress")}></progress>
+      <ol class="steps">${steps.map((one, k) => html`<li class=${k + 1 < step ? "past" : ""}
+        aria-current=${k + 1 === step ? "step" : nothing}>${one}</li>`)}</ol>` : nothing}
+    <p class="quiet">${[steps.length ? page.say("step", {step, steps: steps.length}) : "",
+      busy && since_ns ? lasted(Date.now() / 1000 - since_ns / 1e9) : ""].filter(Boolean).join(" · ")}</p>
+    ${notice(page, told.notice)}
+    ${page.calls.at(-1)?.refused
+      ? html`<p class="refused" role="alert">${page.say("refused")} ${page.calls.at(-1).refused}</p>` : nothing}
+  </section>`;
+}
+
+function notice(page, notice) {
+  if (!notice) return nothing;
+  return html`<div class="notice ${notice.good ? "good" : "bad"}" role=${notice.good ? "status" : "alert"}>
+    <p>${notice.text}</p>
+    ${notice.help.length ? html`<ul>${notice.help.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
+    ${notice.good || !notice.message ? nothing : html`<p class="quiet">${page.say("ask_engineer")}
+      <code>runner why ${notice.message}</code></p>`}
+  </div>`;
+}
+
+function cards(page, told) {
+  return html`<section class="cards" aria-labelledby="cards"><h2 id="cards">${told.cards_title}</h2>
+    ${told.cards.length ? nothing : html`<p class="quiet">${told.cards_hint}</p>`}
+    <ul>${told.cards.map((card) => html`<li>
+      ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
+      <h3>${card.title}</h3><p>${card.text}</p>
+      ${card.actions.map((action) => button(page, action))}
+    </li>`)}</ul></section>`;
+}

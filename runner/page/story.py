@@ -1,0 +1,221 @@
+"""What a page tells a person who does not program, in neutral terms; how it is shown is the page's matter.
+
+A graph file names a class (``story: stages.story:Story``) that turns messages into what is told; it is the
+:class:`Story` protocol below. What it tells are values and knows nothing of the page. Texts are in the language that is
+asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.contract import Message
+from runner.graph.graph import Graph, node_entry
+from runner.graph.references import load_class
+
+Language = Literal["en", "de"]
+Surety = Literal["sure", "unsure", "doubtful", "unknown"]
+"""``sure`` can be relied on, ``unsure`` had better be looked at, ``doubtful`` is probably wrong, ``unknown`` is there
+and nobody knows what it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """A picture; equal keys are equal pictures."""
+
+    key: str
+    """Letters, digits, ``.``, ``-`` and ``_``."""
+    rgb: NDArray[np.uint8]
+    """H x W x 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Something seen in a picture."""
+
+    name: str
+    """By which statements refer to it."""
+    label: str
+    surety: Surety
+    how_sure: str
+    """In words."""
+    points: tuple[tuple[int, int], ...]
+    """Its edge, x and y in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The newest picture with what was seen in it."""
+
+    photo: Photo
+    caption: str
+    outlines: tuple[Outline, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """One sentence about the scene; ``about`` names an outline, or is empty."""
+
+    text: str
+    about: str = ""
+    surety: Surety = "sure"
+    how_sure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A field of a command that the person fills in."""
+
+    field: str
+    label: str
+    hint: str = ""
+    pattern: str = ""
+    """Regular expression that the whole text must match; anything by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """A button: a declared command of a stage, with what it takes."""
+
+    stage: str
+    command: str
+    label: str
+    arguments: dict[str, str]
+    ask: Ask | None = None
+    kind: Literal["first", "plain", "stop"] = "plain"
+    """``first`` is what a person most likely wants next, ``stop`` is always in sight."""
+    now: bool = True
+    """Whether it can be done now."""
+    confirm: str = ""
+    """A question to be answered with yes before; none by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """Something that is kept, with what can be done with it."""
+
+    key: str
+    title: str
+    text: str
+    photo: Photo | None
+    actions: tuple[Action, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Something on a map."""
+
+    name: str
+    label: str
+    points: tuple[tuple[float, float], ...]
+    """Its edge, x and y in metres."""
+    x: float
+    """Where it is said to be, metres."""
+    y: float
+    movable: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Map:
+    """Things seen from above, x upwards and y to the left; moving one calls a command that takes name, x and y."""
+
+    title: str
+    hint: str
+    ground: tuple[tuple[float, float], ...]
+    """The edge of what they stand on, metres."""
+    places: tuple[Place, ...]
+    """What lies lower first."""
+    stage: str
+    command: str
+
+
+@dataclass(frozen=True, slots=True)
+class Doing:
+    """What goes on now."""
+
+    text: str
+    busy: bool = False
+    steps: tuple[str, ...] = ()
+    """What is planned in all, with what is done of it."""
+    step: int = 0
+    """The one of them that is at work or comes next, from 1; 0 where there are none."""
+    since_ns: int = 0
+    """When it began, nanoseconds since the epoch."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """How the last thing ended."""
+
+    good: bool
+    text: str
+    help: tuple[str, ...] = ()
+    """What the person can do about it."""
+    message: str = ""
+    """Id of the message that said so, for the engineer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """All that there is to say now."""
+
+    doing: Doing
+    notice: Notice | None = None
+    view: View | None = None
+    statements: tuple[Statement, ...] = ()
+    actions: tuple[Action, ...] = ()
+    map: Map | None = None
+    cards_title: str = ""
+    cards_hint: str = ""
+    """Shown where there are no cards."""
+    cards: tuple[Card, ...] = ()
+
+    @property
+    def photos(self) -> list[Photo]:
+        """All pictures that are told of."""
+        found = [card.photo for card in self.cards] + [self.view.photo if self.view else None]
+        return [photo for photo in found if photo is not None]
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message as it was recorded."""
+
+    message: Message
+    id: str
+    causes: tuple[str, ...]
+    """Ids of what the step that emitted it had consumed."""
+    time_ns: int
+    """When it was recorded, nanoseconds since the epoch."""
+
+
+class Story(Protocol):
+    """Follows the messages of a run and says what there is to see, to know and to do."""
+
+    hears: tuple[type[Message], ...]
+    """The messages that it follows; the others are not read."""
+
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """``configs`` holds every stage's settings by stage name, as the graph runs with them."""
+        ...
+
+    def hear(self, heard: Heard) -> None:
+        """Takes a message, in recorded order."""
+        ...
+
+    def tell(self, language: Language) -> Told:
+        """What there is to say, in a language."""
+        ...
+
+
+def load_story(graph: Graph) -> Story | None:
+    """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""
+    if graph.story is None:
+        return None
+    story = load_class(graph.story, f"story of graph {graph.name!r}")
+    return story({name: node_entry(node)["config"] for name, node in graph.nodes.items()})

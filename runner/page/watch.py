@@ -1,0 +1,115 @@
+"""Follows the recording of a run while somebody looks at the page, and keeps what there is to tell.
+
+Like `runner view` it reads what is on the disk: however slow a page is, the graph never waits for it. While nobody
+looks, nothing is read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from mcap.records import Metadata
+
+from runner.contract import Message
+from runner.graph.graph import SUPERVISOR, Graph, graph_from_json
+from runner.message.codec import CodecError, Envelope, LogLine, open_envelope, unpack
+from runner.page.story import Doing, Heard, Language, Story, Told, load_story
+from runner.recording.container import POLL_SECONDS, Container, Entry, Growing, open_file
+from runner.recording.recording import LOG, RUN
+
+KEPT_LINES = 300
+"""Log lines that a page shows."""
+
+
+class Watch:
+    """The story and the newest log lines of one run, as far as they have been read."""
+
+    def __init__(self, recording: Path, changed: Callable[[], object], stopped: Callable[[], bool]) -> None:
+        """``changed`` is called, on another thread, after each record that changes something."""
+        self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
+        self._recording = recording
+        self._changed = changed
+        self._stopped = stopped
+        self._looked_at = threading.Event()
+        self._telling = threading.Lock()
+        self._story: Story | None = None
+        self._prepared = False
+        self._heard: dict[str, type[Message]] = {}
+        """Types by topic."""
+
+    def start(self) -> None:
+        """Begins to read, on a thread of its own."""
+        threading.Thread(target=self.read, name="watch", daemon=True).start()
+
+    def look(self, somebody: bool) -> None:
+        """Goes on where somebody looks, and rests where nobody does."""
+        self._looked_at.set() if somebody else self._looked_at.clear()
+
+    def tell(self, language: Language) -> Told:
+        """What there is to say now."""
+        with self._telling:
+            return self._story.tell(language) if self._story else Told(Doing(""))
+
+    def read(self) -> None:
+        """Reads until the run ends, or as far as it is there once it is to stop."""
+        while not self._recording.exists() and not self._stopped():
+            time.sleep(POLL_SECONDS)
+        with open_file(self._recording) as file:
+            for record in Container(Growing(file, self._rest), str(self._recording)):
+                self._take(record)
+                self._rest()
+
+    def _rest(self) -> bool:
+        """Waits while nobody looks; returns whether to stop. The graph itself is read at once: that takes a while."""
+        while self._prepared and not self._looked_at.wait(1.0) and not self._stopped():
+            pass
+        return self._stopped()
+
+    def _take(self, record: Entry | Metadata) -> None:
+        if isinstance(record, Metadata):
+            if record.name == RUN:
+                self._prepare(graph_from_json(record.metadata["graph"], str(self._recording)))
+                self._changed()
+        elif record.topic.startswith(LOG):
+            with contextlib.suppress(CodecError):
+                self.lines.append(unpack(LogLine, record.message.data))
+                self._changed()
+        elif (kind := self._heard.get(record.topic)) is not None:
+            self._hear(kind, record)
+            self._changed()
+
+    def _prepare(self, graph: Graph) -> None:
+        story = load_story(graph)
+        if story is not None:
+            self._heard = {
+                f"{stage}/{port}": kind
+                for stage in (*graph.nodes, SUPERVISOR)
+                for port, kind in graph.outputs_of(stage).items()
+                if issubclass(kind, story.hears)
+            }
+        self._story, self._prepared = story, True
+
+    def _hear(self, kind: type[Message], entry: Entry) -> None:
+        """What cannot be told is named on stderr and left out: the rest is still worth knowing."""
+        assert self._story is not None
+        try:
+            sealed = unpack(Envelope, entry.message.data)
+            heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, entry.message.log_time)
+            with self._telling:
+                self._story.hear(heard)
+        except Exception as error:
+            print(f"{entry.topic} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
+
+
+def told_so_far(recording: Path, language: Language) -> Told:
+    """What there is to say of a run now."""
+    watch = Watch(recording, lambda: None, lambda: True)
+    watch.look(True)
+    watch.read()
+    return watch.tell(language)

@@ -1,0 +1,369 @@
+"""Follows a run and tells what was seen, what goes on, how it ended and what can be done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from runner.contract import Message, Refused
+from runner.page.story import (
+    Action,
+    Ask,
+    Card,
+    Doing,
+    Heard,
+    Language,
+    Map,
+    Notice,
+    Photo,
+    Place,
+    Statement,
+    Told,
+    View,
+)
+from stages.messages import (
+    Arrange,
+    Arrangement,
+    Forget,
+    Frame,
+    Goal,
+    Look,
+    LookRequest,
+    Move,
+    ObjectPose,
+    Outcome,
+    Plan,
+    Restore,
+    SceneEstimate,
+    SceneGraph,
+    Stop,
+    Task,
+    Teach,
+    Transfer,
+    TransferRequest,
+    Verdict,
+)
+from stages.messages.scene import SceneObject
+from stages.messages.task import STOPPED
+from stages.scene.catalogue import Catalogue
+from stages.scene.text import support
+from stages.story.outlines import footprint, ground, how_sure, outlines, region_name, surety
+from stages.story.words import Words, words_of
+
+DEMONSTRATOR, WORLD = "demonstrator", "world"
+"""Stages that take commands, as our graphs call them."""
+NAME = r"[\p{L}\p{N}_\-]+"
+"""What the name of a goal may be."""
+SHOWN_FAULTS = 4
+"""Relations that do not hold, of a goal that was not reached."""
+Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "move"]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What the robot is doing for somebody."""
+
+    name: str
+    """Of the goal; empty for a look."""
+    began_ns: int
+    phase: Phase = "look"
+    done: int = 0
+    """Transfers that have ended."""
+    transfers: tuple[Transfer, ...] = ()
+    """Those and what the newest plan adds."""
+    holders: frozenset[str] = frozenset()
+    """Objects that things are put into rather than onto."""
+    stopping: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """A goal, and the picture in which it was shown."""
+
+    goal: Goal
+    photo: Photo | None
+
+
+class Story:
+    """Remembers the newest picture and scene, all goals, and what is under way."""
+
+    hears: tuple[type[Message], ...] = (
+        *(Teach, Restore, Forget, Look, Stop, Arrange, Arrangement, Move),
+        *(LookRequest, Frame, SceneEstimate, SceneGraph),
+        *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
+    )
+
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
+        paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
+        if not paths:
+            raise Refused(f"story: none of the stages {', '.join(configs)} has a setting `catalogue`; objects need one")
+        self._catalogue = Catalogue.load(Path(paths[0]))
+        self._commanded = DEMONSTRATOR in configs and not configs[DEMONSTRATOR].get("scripted", True)
+        self._simulated = WORLD in configs
+        self._asked: dict[str, Teach | Restore | Look] = {}
+        """Commands by id, until the stage takes them up."""
+        self._caused_look: tuple[str, ...] = ()
+        """Ids of what the newest look was asked for by."""
+        self._job: Job | None = None
+        self._goals: dict[str, Remembered] = {}
+        self._photo: Photo | None = None
+        self._moved = False
+        """Whether something was moved since the picture was taken."""
+        self._estimate: SceneEstimate | None = None
+        self._scene: SceneGraph | None = None
+        self._ended: tuple[Goal | Verdict, str] | None = None
+        """How the last job ended, and the id of the message that said so."""
+        self._draws = 0
+        """Disturbed scenes so far: each number draws another."""
+
+    # ------------------------------------------------------------------------------------------ what is heard
+
+    def hear(self, heard: Heard) -> None:
+        """Takes a message."""
+        match heard.message:
+            case Teach() | Restore() | Look() as command:
+                self._ask(command, heard)
+            case LookRequest():
+                self._begin(heard)
+            case Frame() as frame:
+                self._photo = Photo(heard.id.replace("#", "-"), frame.rgb)
+                self._estimate = self._scene = None
+                self._moved = False
+                self._at("recognise")
+            case SceneEstimate() as estimate:
+                self._estimate = estimate
+            case SceneGraph() as scene:
+                self._see(scene)
+            case Move() as move:
+                self._moved = True
+                self._scene = self._scene and _with_moved(self._scene, move)
+            case Arrange() | Arrangement() as arranged:
+                self._moved, self._scene = True, None
+                self._draws += arranged.kind == "start"
+            case Forget(name=name):
+                self._goals.pop(name, None)
+            case Goal() | Verdict() as end:
+                self._end(end, heard.id)
+            case _:
+                self._work(heard.message)
+
+    def _work(self, message: Message) -> None:
+        """What moves a job on."""
+        if self._job is None:
+            return
+        match message:
+            case Stop():
+                self._job = replace(self._job, stopping=True)
+            case Task(current=scene):
+                holders = {item.name for item in scene.objects if self._catalogue[item.label].concave}
+                self._job = replace(self._job, phase="plan", holders=frozenset(holders))
+            case Plan(transfers=transfers):
+                self._job = replace(self._job, transfers=(*self._job.transfers[: self._job.done], *transfers))
+            case TransferRequest():
+                self._at("move")
+            case Outcome(number=number):
+                self._moved, self._scene = True, None
+                self._job = replace(self._job, done=number)
+            case _:
+                pass
+
+    def _begin(self, heard: Heard) -> None:
+        """A look: the first of a job that somebody asked for, or one more of the same."""
+        self._caused_look = heard.causes
+        asked = [self._asked.pop(cause) for cause in heard.causes if cause in self._asked]
+        if asked:
+            self._start(asked[0], heard.time_ns)
+        else:
+            self._job = self._job or Job("", heard.time_ns)
+            self._at("check" if self._job.done else "look")
+
+    def _ask(self, command: Teach | Restore | Look, heard: Heard) -> None:
+        """A command; it may be recorded after what the stage did when it took it up."""
+        if heard.id in self._caused_look:
+            self._start(command, heard.time_ns)
+        else:
+            self._asked[heard.id] = command
+
+    def _start(self, command: Teach | Restore | Look, time_ns: int) -> None:
+        self._ended = None
+        match command:
+            case Teach(name=name):
+                self._job = Job(name, time_ns, phase="teach")
+            case Restore(name=name):
+                self._job = Job(name, time_ns, phase="restore")
+            case Look():
+                self._job = Job("", time_ns)
+
+    def _at(self, phase: Phase) -> None:
+        if self._job is not None:
+            self._job = replace(self._job, phase=phase)
+
+    def _see(self, scene: SceneGraph) -> None:
+        self._scene = scene
+        if self._job is not None and not self._job.name and self._commanded:
+            self._job = None  # it was a look, no more
+
+    def _end(self, end: Goal | Verdict, id: str) -> None:
+        if isinstance(end, Goal):
+            self._goals[end.name] = Remembered(end, self._photo)
+        self._ended, self._job = (end, id), None
+
+    # ------------------------------------------------------------------------------------------ what is told
+
+    def tell(self, language: Language) -> Told:
+        """What there is to say."""
+        words = words_of(language)
+        return Told(
+            doing=self._doing(words),
+            notice=self._notice(words),
+            view=self._view(words),
+            statements=tuple(self._statements(words)),
+            actions=tuple(self._actions(words)) if self._commanded else (),
+            map=self._map(words),
+            cards_title=words.say("goals"),
+            cards_hint=words.say("no_goals"),
+            cards=tuple(self._card(name, kept, words) for name, kept in self._goals.items()),
+        )
+
+    def _doing(self, words: Words) -> Doing:
+        job = self._job
+        if job is None:
+            return Doing(words.say("idle" if self._commanded else "script"))
+        steps = tuple(_move(transfer, job, words) for transfer in job.transfers)
+        step = min(job.done + 1, len(steps))
+        if job.stopping:
+            text = words.say("stopping")
+        else:
+            text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
+        return Doing(text, True, steps, step, job.began_ns)
+
+    def _view(self, words: Words) -> View | None:
+        if self._photo is None:
+            return None
+        height, width = self._photo.rgb.shape[:2]
+        found = outlines(self._estimate, self._catalogue, (height, width), words) if self._estimate else ()
+        return View(self._photo, words.say("outdated" if self._moved else "seen"), found)
+
+    def _statements(self, words: Words) -> Iterator[Statement]:
+        if self._moved and self._job is None:
+            yield Statement(words.say("moved"), surety="unknown")
+        elif self._scene is not None:
+            yield from self._known(self._scene, words)
+
+    def _known(self, scene: SceneGraph, words: Words) -> Iterator[Statement]:
+        """What is there, and what stands on, in or next to what."""
+        judged = {item.name: item for item in self._estimate.objects} if self._estimate else {}
+        beside: dict[str, list[str]] = {}
+        for virtual in scene.virtual_objects:
+            beside.setdefault(virtual.child, []).append(virtual.parent)
+        for name, (supporter, how) in support(scene).items():
+            text = words.say(f"is_{how}", child=words.noun(name), supporter=words.noun(supporter))
+            if name in beside:
+                text += words.say("beside", parents=words.nouns(beside[name]))
+            yield _statement(f"{text}.", name, judged.get(name), words)
+        for number, region in enumerate(self._estimate.unknown if self._estimate else ()):
+            size = " x ".join(f"{100 * edge:.0f}" for edge in region.extent_table)
+            text = words.say("unknown", size=size)
+            yield Statement(f"{text}.", region_name(number), "unknown", words.say("unexplained"))
+
+    def _actions(self, words: Words) -> Iterator[Action]:
+        idle = self._job is None
+        stoppable = self._job is not None and not self._job.stopping
+        ask = Ask("name", words.say("name"), words.say("name_hint"), NAME)
+        yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {}, ask, kind="first", now=idle)
+        yield Action(DEMONSTRATOR, "look", words.say("do_look"), {}, now=idle)
+        if self._simulated:
+            draw = {"draw": str(self._draws)}
+            yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
+            yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
+        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
+
+    def _map(self, words: Words) -> Map | None:
+        """The scene from above, where people may move what carries nothing."""
+        scene = self._scene
+        if scene is None or not (self._simulated and self._commanded and self._job is None):
+            return None
+        carried = support(scene)
+        carriers = {supporter for supporter, _ in carried.values()}
+        objects = sorted(scene.objects, key=lambda item: item.T_base_object[2, 3])
+        places = tuple(
+            Place(
+                item.name,
+                words.bare(item.name),
+                footprint(self._catalogue[item.label], item.T_base_object),
+                float(item.T_base_object[0, 3]),
+                float(item.T_base_object[1, 3]),
+                item.name not in carriers,
+            )
+            for item in objects
+        )
+        return Map(words.say("map"), words.say("map_hint"), ground(scene), places, WORLD, "move")
+
+    def _card(self, name: str, kept: Remembered, words: Words) -> Card:
+        names = [item.name for item in kept.goal.scene.objects]
+        text = words.say("goal", count=len(names), objects=words.nouns(names))
+        restore = Action(
+            DEMONSTRATOR, "restore", words.say("do_restore"), {"name": name}, kind="first", now=self._job is None
+        )
+        sure = words.say("forget_sure", name=name)
+        forget = Action(DEMONSTRATOR, "forget", words.say("do_forget"), {"name": name}, confirm=sure)
+        return Card(name, name, text, kept.photo, (restore, forget) if self._commanded else ())
+
+    # ------------------------------------------------------------------------------------------ how it ended
+
+    def _notice(self, words: Words) -> Notice | None:
+        if self._ended is None:
+            return None
+        end, id = self._ended
+        if isinstance(end, Goal):
+            names = [item.name for item in end.scene.objects]
+            return Notice(True, words.say("remembered", name=end.name, objects=words.nouns(names)), message=id)
+        if end.success:
+            return Notice(True, words.say("restored", name=end.goal_name), message=id)
+        if end.failed_stage == STOPPED:
+            return Notice(True, words.say("stopped"), message=id)
+        key = "failed" if end.goal_name in self._goals else "not_remembered"
+        help = (*self._faults(end, words), words.say(f"help_{end.failed_stage}"))
+        return Notice(False, words.say(key, name=end.goal_name, reason=end.reason), help, id)
+
+    def _faults(self, verdict: Verdict, words: Words) -> list[str]:
+        """What is not where it belongs, as sentences."""
+        kept = self._goals.get(verdict.goal_name)
+        virtual = {item.name: item for item in kept.goal.scene.virtual_objects} if kept else {}
+        found: list[str] = []
+        for item in verdict.violated:
+            if item.predicate in ("on", "in") and item.arguments[0] not in virtual:
+                child, supporter = map(words.noun, item.arguments)
+                found.append(words.say(f"should_{item.predicate}", child=child, supporter=supporter))
+            elif item.predicate == "in":
+                region = virtual[item.arguments[0]]
+                parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
+                found.append(words.say("should_beside", **parts))
+        return found[:SHOWN_FAULTS]
+
+
+def _statement(text: str, name: str, item: ObjectPose | None, words: Words) -> Statement:
+    return Statement(text, name) if item is None else Statement(text, name, surety(item), how_sure(item, words))
+
+
+def _move(transfer: Transfer, job: Job, words: Words) -> str:
+    """A transfer as a sentence."""
+    key = "put_in" if transfer.destination in job.holders else "put_on"
+    return words.say(key, object=words.noun(transfer.object), destination=words.noun(transfer.destination))
+
+
+def _with_moved(scene: SceneGraph, move: Move) -> SceneGraph:
+    """A scene in which somebody has put an object elsewhere; the next look says what it stands on now."""
+    objects = (_moved(item, move) if item.name == move.name else item for item in scene.objects)
+    return msgspec.structs.replace(scene, objects=tuple(objects))
+
+
+def _moved(item: SceneObject, move: Move) -> SceneObject:
+    T = item.T_base_object.copy()
+    T[:2, 3] = move.x, move.y
+    return msgspec.structs.replace(item, T_base_object=T)

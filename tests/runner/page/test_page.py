@@ -1,0 +1,302 @@
+"""The page of a running graph, in a real browser and by bare requests."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import signal
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from websockets.sync.client import connect
+
+from runner.contract import Refused
+from runner.page.guard import new_token
+from runner.testing import finish, read_until, runner, start_graph
+from tests.runner.common.waiting import wait_until
+from tests.runner.page.browser import browser, faults, opened
+
+LAMP = Path(__file__).with_name("lamp.yaml")
+VIEWS = ("scene", "history", "engineer")
+
+
+class Lamp:
+    """A run of the lamp and where its page is."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.process = start_graph(LAMP, folder=folder)
+        self.printed = read_until(self.process, "page: http")
+        self.url = re.findall(r"page: (\S+)", self.printed)[0]
+        if "processes are ready" not in self.printed:
+            self.printed += read_until(self.process, "processes are ready")
+
+    def finish(self) -> None:
+        self.process.terminate()
+        finish(self.process, self.folder, before=self.printed)
+
+
+@pytest.fixture(scope="module")
+def lamp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lamp]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
+        running = Lamp(tmp_path_factory.mktemp("lamp"))
+        yield running
+        running.finish()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    with browser() as started:
+        yield started
+
+
+@pytest.fixture
+def page(lamp: Lamp, chromium: Browser) -> Iterator[Page]:
+    with opened(chromium, lamp.url) as shown:
+        yield shown
+
+
+# ------------------------------------------------------------------------------------------ who may see it
+
+
+def asked(url: str, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, str]:
+    """Status and text of an answer; ``path`` is below the server, not below the token."""
+    with closing(http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)) as connection:
+        connection.request(method, path, body or None, headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode(errors="replace")
+
+
+def test_only_who_has_the_whole_address_sees_anything(lamp: Lamp) -> None:
+    token = urlsplit(lamp.url).path
+    assert asked(lamp.url, token)[0] == 200
+    for path in ("/", f"{token[:-2]}/", f"/{'x' * 22}/", "/page.js", f"{token[:-1]}x/page.js"):
+        assert asked(lamp.url, path) == (
+            403,
+            "no or another token: open the whole address that `runner up --page` has printed\n",
+        )
+    assert asked(lamp.url, f"{token}../../pyproject.toml")[0] in (403, 404)
+    assert asked(lamp.url, f"{token}runs/..%2f..%2fsecret.mcap")[0] == 404
+
+
+def test_other_pages_and_other_names_of_this_machine_are_refused(lamp: Lamp) -> None:
+    path, own = urlsplit(lamp.url).path, urlsplit(lamp.url).netloc
+    status, reason = asked(lamp.url, path, Host="evil.example")
+    assert (status, reason.startswith("Host 'evil.example': this page is not there; valid: ")) == (403, True)
+    for origin in ("http://evil.example", "null", f"http://{own}0"):
+        status, reason = asked(lamp.url, f"{path}call", "POST", "{}", Origin=origin)
+        assert (status, reason) == (403, f"Origin {origin!r}: another page may not speak to this one\n")
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    key = {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    assert asked(lamp.url, f"{path}live", Origin="http://evil.example", **upgrade, **key)[0] == 403
+    assert asked(lamp.url, "/live", Origin=f"http://{own}", **upgrade, **key)[0] == 403
+
+
+def test_no_page_is_open_to_other_machines_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(new_token("127.0.0.1", "")) > 20 and new_token("::1", "") != new_token("::1", "")
+    assert new_token("192.168.1.7", "a-long-enough_token") == "a-long-enough_token"
+    with pytest.raises(
+        Refused, match=r"--address 192\.168\.1\.7: a page beyond this machine needs a token: set RUNNER"
+    ):
+        new_token("192.168.1.7", "")
+    with pytest.raises(Refused, match="RUNNER_PAGE_TOKEN: must be 16 or more letters"):
+        new_token("192.168.1.7", "short")
+
+
+def test_the_page_is_not_named_where_others_can_read(lamp: Lamp) -> None:
+    token = urlsplit(lamp.url).path.strip("/").encode()
+    for path in lamp.folder.rglob("*"):
+        assert path.is_dir() or token not in path.read_bytes()
+    command_lines = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
+    assert not any(token in line for line in command_lines)
+
+
+# ------------------------------------------------------------------------------------------ what is asked
+
+
+def test_what_cannot_be_called_is_refused_in_words(lamp: Lamp) -> None:
+    path = f"{urlsplit(lamp.url).path}call"
+
+    def call(**request: object) -> tuple[int, str]:
+        return asked(lamp.url, path, "POST", json.dumps(request))
+
+    assert call(stage="lamp", command="blink", arguments={"time": "2"}) == (
+        422,
+        "lamp blink: no field 'time'; did you mean 'times'? valid: times",
+    )
+    assert call(stage="lamp", command="blink", arguments={"times": "many"})[0] == 422
+    assert call(stage="lamp", command="burn", arguments={})[1].startswith("lamp has no command 'burn'")
+    assert call(stage="lamp")[0] == 422
+    assert asked(lamp.url, path)[0] == 404
+
+
+def test_recordings_are_listed_and_can_be_downloaded(lamp: Lamp) -> None:
+    path = urlsplit(lamp.url).path
+    (run,) = json.loads(asked(lamp.url, f"{path}runs")[1])
+    assert run["running"] and run["name"].startswith("lamp-")
+    status, _ = asked(lamp.url, f"{path}runs/{run['name']}.mcap")
+    assert status == 200
+
+
+# ------------------------------------------------------------------------------------------ what is shown
+
+
+def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None:
+    expect(page.get_by_text("has blinked 0 times")).to_be_visible()
+    expect(page.get_by_role("img", name="A lamp.")).to_be_visible()
+    assert page.evaluate("document.querySelector('figure img').naturalWidth") == 64
+    expect(page.locator(".picture .name")).to_have_text(
+        ["? unknown lamp", "! doubtful lamp", "? unsure lamp", "✓ sure lamp"]
+    )
+    page.get_by_label("How often").fill("3")
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("has blinked 3 times")).to_be_visible()
+    page.get_by_role("button", name="Dizzy").click()
+    refusal = page.get_by_role("alert").filter(has_text="makes people dizzy")
+    expect(refusal).to_have_text("That does not work: times=10: makes people dizzy; valid: 1 to 9")
+
+
+def test_things_are_moved_by_mouse_and_by_keys(page: Page) -> None:
+    thing = page.get_by_role("button", name="lamp", exact=True)
+    thing.scroll_into_view_if_needed()
+    box = thing.locator("path").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 0.5 * box["width"], y - 0.5 * box["height"], steps=4)  # a tenth of a metre, as it is 0.2 wide
+    page.mouse.up()
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    x, y = carried(page, 1)
+    assert (x, y) == pytest.approx((0.6, -0.1), abs=0.02)
+    page.goto(f"{page.url.partition('#')[0]}#scene")
+    thing.focus()
+    for key in ("ArrowLeft", "ArrowLeft", "ArrowDown", "Enter"):
+        page.keyboard.press(key)
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    assert carried(page, 2) == pytest.approx((x - 0.02, y + 0.04), abs=0.006)
+
+
+def carried(page: Page, times: int) -> tuple[float, float]:
+    """Where the lamp was carried last, once it was so often."""
+    lines = page.get_by_role("log").get_by_text("carried to")
+    expect(lines).to_have_count(times)
+    x, y = lines.first.inner_text().split()[-2:]
+    return float(x), float(y)
+
+
+def test_a_page_that_stands_still_keeps_nobody_waiting(lamp: Lamp, page: Page) -> None:
+    place = urlsplit(lamp.url)
+    with connect(f"ws://{place.netloc}{place.path}live", max_queue=1, max_size=None, close_timeout=0.1) as still:
+        still.send(json.dumps({"view": "engineer", "language": "en"}))
+        for number in range(200):
+            body = json.dumps({"stage": "lamp", "command": "switch", "arguments": {"note": f"{number} {'x' * 4000}"}})
+            assert asked(lamp.url, f"{place.path}call", "POST", body)[0] == 200
+        page.goto(f"{lamp.url}#engineer")
+        expect(page.get_by_role("log")).to_contain_text("is dark 199")
+
+
+def test_escape_stops_wherever_the_focus_is(page: Page) -> None:
+    page.get_by_label("How often").focus()
+    page.keyboard.press("Escape")
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    expect(page.get_by_role("log")).to_contain_text("lamp stopped")
+
+
+def test_an_engineer_sees_processes_topics_calls_and_the_log(page: Page) -> None:
+    page.get_by_role("link", name="Engineer").click()
+    process = page.get_by_role("region", name="Processes").get_by_role("row").filter(has_text="lamp")
+    expect(process).to_contain_text("waiting")
+    expect(page.get_by_role("region", name="Topics").get_by_role("row").filter(has_text="lamp/blinked")).to_be_visible()
+    form = page.get_by_role("form", name="lamp switch")
+    form.get_by_label("on", exact=True).check()
+    form.get_by_label("colour").select_option("blue")
+    form.get_by_label("note").fill("for a while")
+    form.get_by_role("button", name="Call").click()
+    expect(page.get_by_role("log")).to_contain_text("lamp is blue for a while")
+    form.get_by_label("on", exact=True).uncheck()
+    form.get_by_role("button", name="Call").click()
+    expect(page.get_by_role("log")).to_contain_text("lamp is dark")
+    page.get_by_role("form", name="lamp blink").get_by_label("times").fill("1")
+    page.get_by_role("form", name="lamp blink").get_by_role("button").click()
+    expect(page.get_by_text("Answer").first).to_be_visible()
+
+
+def test_all_of_it_is_there_in_german(lamp: Lamp, chromium: Browser) -> None:
+    with opened(chromium, lamp.url, language="de-AT") as page:
+        expect(page.get_by_text("-mal geblinkt")).to_be_visible()
+        expect(page.get_by_role("link", name="Technik")).to_be_visible()
+        assert page.evaluate("document.documentElement.lang") == "de"
+        page.get_by_label("Sprache").select_option("en")
+        expect(page.get_by_text("has blinked")).to_be_visible()
+        page.reload()
+        expect(page.get_by_role("link", name="Engineer")).to_be_visible()
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("view", VIEWS)
+def test_every_view_can_be_used_without_eyes_mouse_or_a_large_screen(
+    lamp: Lamp, chromium: Browser, view: str, width: int
+) -> None:
+    with opened(chromium, f"{lamp.url}#{view}", width=width) as page:
+        expect(page.get_by_role("heading", level=2).first).to_be_visible()
+        assert faults(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_the_texts_of_both_languages_are_the_same_ones() -> None:
+    static = Path(__file__).parents[3] / "runner" / "page" / "static"
+    english, german = (json.loads((static / f"{language}.json").read_text()) for language in ("en", "de"))
+    assert english.keys() == german.keys()
+    for key, text in english.items():
+        assert sorted(re.findall(r"\{\w+\}", text)) == sorted(re.findall(r"\{\w+\}", german[key])), key
+    asked_for = {key for path in static.glob("*.js") for key in re.findall(r'page\.say\("(\w+)"', path.read_text())}
+    assert asked_for <= english.keys()
+
+
+def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
+    assert runner("goals").communicate(timeout=60)[0] == (
+        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n"
+    )
+    wrong = runner("goals", "A lump")
+    assert (wrong.communicate(timeout=60)[0], wrong.returncode) == (
+        "A lump: is not remembered; did you mean 'A lamp'? valid: A lamp\n",
+        2,
+    )
+
+
+# ------------------------------------------------------------------------------------------ beginning and end
+
+
+def test_a_page_says_that_the_run_has_ended_and_leaves_no_process(
+    chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    running = Lamp(tmp_path / "run")
+    (page_process,) = children(running.process.pid, "page")
+    with opened(chromium, running.url) as page:
+        expect(page.get_by_text("has blinked")).to_be_visible()
+        running.process.send_signal(signal.SIGINT)
+        expect(page.get_by_text("cannot be reached")).to_be_visible()
+        expect(page.get_by_role("button", name="Blink")).to_be_disabled()
+    running.finish()
+    wait_until(lambda: not Path(f"/proc/{page_process}").exists())
+
+
+def children(pid: int, command: str) -> list[int]:
+    """Processes whose parent is ``pid`` and that were started with a command of the runner."""
+    found: list[int] = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and f"\0{command}\0" in (path / "cmdline").read_text():
+                found.append(int(path.name))
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,423 @@
+"""What people are told of an episode, message by message, without a page."""
+
+from __future__ import annotations
+
+import re
+import string
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import yaml
+
+from runner.contract import Message, Refused
+from runner.page.story import Heard, Language, Notice, Told
+from stages.messages import (
+    Arrange,
+    Assertion,
+    Forget,
+    Frame,
+    Goal,
+    Look,
+    LookRequest,
+    Move,
+    ObjectPose,
+    Restore,
+    SceneEstimate,
+    SceneGraph,
+    Stop,
+    Task,
+    Teach,
+    TransferRequest,
+    Verdict,
+)
+from stages.messages.scene import UnknownRegion
+from stages.messages.task import STOPPED
+from stages.scene.catalogue import BUILT_IN, Catalogue
+from stages.story import Story, words
+from stages.story.words import words_of
+from tests.stages.episodes import K, outcome, plan, scene, transfer
+
+CONFIGS: dict[str, dict[str, Any]] = {"demonstrator": {"catalogue": BUILT_IN, "scripted": False}, "world": {}}
+GOAL = scene({"tray": "table", "cup": "tray", "tea_box": "table"}, beside={"tea_box": "tray"})
+START = scene({"tray": "table", "cup": "table", "tea_box": "table"})
+STEP = transfer("cup", "table", "tray")
+T_CAMERA_CUP = np.array([[1.0, 0, 0, 0], [0, -0.6, -0.8, 0], [0, 0.8, -0.6, 0.8], [0, 0, 0, 1]])
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+
+
+class Listener:
+    """A story that is told messages with ids of their own."""
+
+    def __init__(self, **configs: dict[str, Any]) -> None:
+        self.story = Story({**CONFIGS, **configs})
+        self._heard = 0
+
+    def hear(self, *messages: Message, causes: tuple[str, ...] = ()) -> str:
+        """Tells it messages; returns the id of the last."""
+        for message in messages:
+            self._heard += 1
+            id = f"stage.port#{self._heard}"
+            self.story.hear(Heard(message, id, causes, 1_000_000_000 * self._heard))
+        return f"stage.port#{self._heard}"
+
+    def called(self, command: Teach | Restore | Look) -> None:
+        """A command, and the look that follows it."""
+        self.hear(LookRequest(purpose="look"), causes=(self.hear(command),))
+
+    def seen(self, graph: SceneGraph, **fields: object) -> None:
+        self.hear(frame(), estimate(**fields), graph)
+
+    def taught(self) -> None:
+        self.called(Teach(name="tea"))
+        self.seen(GOAL)
+        self.hear(Goal(name="tea", scene=GOAL, pddl=""))
+
+    def told(self, language: Language = "en") -> Told:
+        return self.story.tell(language)
+
+    @property
+    def doing(self) -> str:
+        return self.told().doing.text
+
+    @property
+    def notice(self) -> Notice:
+        notice = self.told().notice
+        assert notice is not None
+        return notice
+
+    def offered(self) -> dict[str, bool]:
+        return {action.command: action.now for action in self.told().actions}
+
+
+def frame() -> Frame:
+    rgb, depth = np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.float32)
+    return Frame(rgb=rgb, depth=depth, K=K, T_base_camera=None, robot_mask=None, name="", index=0, total=0)
+
+
+def estimate(probability: float | None = 0.97, *, contradicted: bool = False, unknown: int = 0) -> SceneEstimate:
+    cup = ObjectPose(
+        name="cup",
+        label="cup",
+        T_camera_object=T_CAMERA_CUP,
+        confidence=0.9,
+        cost=1.5,
+        box=np.array([300.0, 200, 360, 280]),
+        probability=probability,
+        contradicted=contradicted,
+    )
+    region = UnknownRegion(
+        box=np.array([10.0, 20, 60, 80]), points=90, centre_table=np.zeros(3), extent_table=np.array([0.07, 0.05, 0.09])
+    )
+    return SceneEstimate(
+        objects=(cup,),
+        winner=0,
+        log_weights=np.zeros(1),
+        left_out=0,
+        T_camera_table=np.eye(4),
+        T_base_camera=None,
+        K=K,
+        unknown=(region,) * unknown,
+    )
+
+
+def verdict(failed_stage: str = "", reason: str = "", violated: tuple[Assertion, ...] = ()) -> Verdict:
+    return Verdict(
+        goal_name="tea",
+        success=not failed_stage,
+        failed_stage=failed_stage,
+        reason=reason,
+        satisfied=(),
+        violated=violated,
+    )
+
+
+# ------------------------------------------------------------------------------------------ what is there
+
+
+def test_before_the_first_look_there_is_nothing_to_see_and_something_to_do() -> None:
+    told = Listener().told()
+    assert (told.doing.text, told.doing.busy, told.view, told.statements) == (
+        "The robot waits for you",
+        False,
+        None,
+        (),
+    )
+    assert Listener().offered() == {"teach": True, "look": True, "arrange": True, "stop": False}
+
+
+def test_a_scene_is_sentences_and_outlines() -> None:
+    listener = Listener()
+    listener.called(Look())
+    listener.seen(GOAL, unknown=1)
+    told = listener.told()
+    assert [one.text for one in told.statements] == [
+        "The tray is on the table.",
+        "The cup is in the tray.",
+        "The tea box is on the table, next to the tray.",
+        "There is something that I do not know, about 7 x 5 x 9 cm large.",
+    ]
+    assert [one.how_sure for one in told.statements] == ["", "Sure", "", "Unknown"]
+    assert told.view is not None
+    cup, unknown = told.view.outlines
+    assert (cup.name, cup.label, unknown.label, unknown.surety) == ("cup", "cup", "Unknown", "unknown")
+    assert {one.name for one in told.view.outlines} <= {one.about for one in told.statements}
+
+
+def test_an_outline_encloses_what_the_object_covers() -> None:
+    listener = Listener()
+    listener.seen(GOAL)
+    view = listener.told().view
+    assert view is not None
+    corners = np.array(view.outlines[0].points)
+    mesh = Catalogue.load(BUILT_IN)["cup"].mesh
+    points = mesh.vertices @ T_CAMERA_CUP[:3, :3].T + T_CAMERA_CUP[:3, 3]
+    pixels = (points @ K.T)[:, :2] / points[:, 2:]
+    assert np.abs(corners.min(0) - pixels.min(0)).max() < 3 and np.abs(corners.max(0) - pixels.max(0)).max() < 3
+
+
+def test_what_is_behind_the_camera_or_beside_the_image_has_no_outline() -> None:
+    for shift in ([0, 0, -2.0], [9.0, 0, 0]):
+        listener, elsewhere = Listener(), estimate()
+        elsewhere.objects[0].T_camera_object[:3, 3] += shift
+        try:
+            listener.hear(frame(), elsewhere, GOAL)
+            view = listener.told().view
+            assert view is not None and view.outlines == ()
+        finally:
+            elsewhere.objects[0].T_camera_object[:3, 3] -= shift
+
+
+@pytest.mark.parametrize(
+    ("probability", "contradicted", "surety", "words"),
+    [
+        (0.97, False, "sure", "Sure"),
+        (None, False, "unsure", "Not judged yet"),
+        (0.72, False, "unsure", "Not quite sure (72 %)"),
+        (0.2, False, "doubtful", "Probably wrong"),
+        (0.97, True, "doubtful", "Probably wrong"),
+    ],
+)
+def test_how_sure_it_is_is_said(probability: float | None, contradicted: bool, surety: str, words: str) -> None:
+    listener = Listener()
+    listener.seen(GOAL, probability=probability, contradicted=contradicted)
+    cup = next(one for one in listener.told().statements if one.about == "cup")
+    assert (cup.surety, cup.how_sure) == (surety, words)
+
+
+def test_a_picture_says_when_it_is_outdated() -> None:
+    listener = Listener()
+    listener.seen(GOAL)
+    captions: list[str] = []
+    for message in (Look(), Arrange(kind="start"), frame()):
+        listener.hear(message)
+        view = listener.told().view
+        assert view is not None
+        captions.append(view.caption)
+    assert [one.text for one in listener.told().statements] == []
+    seen, moved = "What the robot saw last", "What the robot saw before something was moved"
+    assert captions == [seen, moved, seen]
+
+
+def test_what_was_moved_is_not_claimed_to_be_where_it_was() -> None:
+    listener = Listener()
+    listener.called(Look())
+    listener.seen(START)
+    for message in (Move(name="cup", x=0.6, y=0.1), Arrange(kind="goal")):
+        listener.hear(message)
+        (only,) = listener.told().statements
+        assert only.text == "Something was moved since. Let the robot look again."
+
+
+def test_the_map_shows_what_can_be_moved_and_where_it_was_put() -> None:
+    listener = Listener()
+    listener.called(Look())
+    assert listener.told().map is None
+    listener.seen(GOAL)
+    found = listener.told("de").map
+    assert found is not None
+    assert [(one.label, one.movable) for one in found.places] == [
+        *(("Tablett", False), ("Teeschachtel", True), ("Tasse", True))
+    ]
+    cup = Catalogue.load(BUILT_IN)["cup"]
+    edge = np.array(found.places[2].points) - [found.places[2].x, found.places[2].y]
+    assert np.allclose(edge.min(0), cup.bounds[0, :2], atol=0.002) and np.allclose(
+        edge.max(0), cup.bounds[1, :2], atol=0.002
+    )
+    assert np.array(found.ground).min() < min(one.y for one in found.places)
+    listener.hear(Move(name="cup", x=0.61, y=0.15))
+    moved = listener.told().map
+    assert moved is not None and (moved.places[2].x, moved.places[2].y) == (0.61, 0.15)
+    listener.hear(Arrange(kind="start"))
+    assert listener.told().map is None
+
+
+def test_every_disturbance_is_another() -> None:
+    listener = Listener()
+    listener.hear(Arrange(kind="start"), Arrange(kind="goal"), Arrange(kind="start"))
+    disturb = next(one for one in listener.told().actions if one.arguments.get("kind") == "start")
+    assert disturb.arguments == {"kind": "start", "draw": "2"}
+
+
+# ------------------------------------------------------------------------------------------ what goes on
+
+
+def test_a_goal_is_taught_and_becomes_a_card() -> None:
+    listener = Listener()
+    listener.called(Teach(name="tea"))
+    assert listener.doing == "Looks at the scene to remember it as “tea”"
+    assert listener.offered() == {"teach": False, "look": False, "arrange": False, "stop": True}
+    listener.seen(GOAL)
+    assert listener.doing == "Recognises what is there"
+    listener.hear(Goal(name="tea", scene=GOAL, pddl=""))
+    assert (listener.doing, listener.notice.text) == (
+        "The robot waits for you",
+        "“tea” is remembered: the tray, the cup and the tea box.",
+    )
+    (card,) = listener.told().cards
+    assert (card.title, card.text) == ("tea", "3 objects: the tray, the cup and the tea box")
+    assert card.photo is not None and card.photo in listener.told().photos
+    assert [(one.command, one.arguments, one.now, one.confirm) for one in card.actions] == [
+        ("restore", {"name": "tea"}, True, ""),
+        ("forget", {"name": "tea"}, True, "Forget “tea” for good?"),
+    ]
+    listener.hear(Forget(name="tea"))
+    assert listener.told().cards == ()
+
+
+@pytest.mark.parametrize("command_first", [True, False])
+def test_a_command_may_be_recorded_before_or_after_what_it_causes(command_first: bool) -> None:
+    listener = Listener()
+    heard = [
+        Heard(Restore(name="tea"), "supervisor.demonstrator_restore#0", (), 5),
+        Heard(LookRequest(purpose="x"), "demonstrator.look_request#0", ("supervisor.demonstrator_restore#0",), 6),
+    ]
+    for one in heard if command_first else reversed(heard):
+        listener.story.hear(one)
+    assert listener.doing == "Looks at what there is to do for “tea”"
+
+
+def test_a_command_that_was_refused_changes_nothing() -> None:
+    listener = Listener()
+    listener.hear(Restore(name="lunch"), Stop())
+    assert (listener.doing, listener.offered()["stop"]) == ("The robot waits for you", False)
+
+
+def test_a_restore_is_told_step_by_step() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    assert listener.told().notice is None
+    listener.seen(START)
+    listener.hear(Task(goal_name="tea", goal=GOAL, current=START))
+    assert listener.doing == "Thinks about what to move first"
+    other = transfer("tea_box", "table", "table")
+    listener.hear(plan(STEP, other), TransferRequest(transfer=STEP, scene=START, number=1))
+    doing = listener.told().doing
+    assert (doing.text, doing.step, doing.busy) == ("Puts the cup into the tray", 1, True)
+    assert doing.steps == ("Puts the cup into the tray", "Puts the tea box on the table")
+    listener.hear(outcome(1, STEP), LookRequest(purpose="after transfer 1"))
+    assert (listener.doing, listener.told().doing.step) == ("Looks whether it is where it belongs", 2)
+    listener.seen(START)
+    listener.hear(plan(other), TransferRequest(transfer=other, scene=START, number=2))
+    assert listener.doing == "Puts the tea box on the table"
+    assert listener.told("de").doing.text == "Stellt die Teeschachtel auf den Tisch"
+    listener.hear(verdict())
+    assert (listener.notice.good, listener.notice.text) == (True, "“tea” is restored: everything is where it belongs.")
+
+
+def test_a_stop_is_told_until_it_has_come() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    listener.hear(Stop())
+    assert (listener.doing, listener.offered()["stop"]) == ("Finishes this, then stops", False)
+    listener.hear(verdict(STOPPED, "stopped, as asked"))
+    assert (listener.notice.text, listener.notice.good) == ("Stopped, as you asked.", True)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+@pytest.mark.parametrize("stage", ["perception", "planner", "executor"])
+def test_a_failure_says_what_is_wrong_and_what_helps(stage: str, language: Language) -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    violated = (
+        Assertion(predicate="in", arguments=("cup", "tray")),
+        Assertion(predicate="in", arguments=("tea_box_near_tray", "tea_box")),
+        Assertion(predicate="clear", arguments=("cup",)),
+    )
+    id = listener.hear(verdict(stage, "no room", violated))
+    notice = listener.told(language).notice
+    assert notice is not None
+    assert (notice.good, notice.message, len(notice.help), "no room" in notice.text) == (False, id, 3, True)
+    assert language != "en" or notice.help[:2] == (
+        "The cup should be in the tray.",
+        "The tea box should be next to the tray.",
+    )
+
+
+def test_what_was_not_remembered_is_said_so() -> None:
+    listener = Listener()
+    listener.called(Teach(name="tea"))
+    listener.hear(verdict("perception", "2 of 6 objects seen"))
+    assert listener.notice.text == "“tea” is not remembered: 2 of 6 objects seen."
+
+
+def test_a_scripted_robot_takes_no_commands() -> None:
+    listener = Listener(demonstrator={"catalogue": BUILT_IN, "scripted": True})
+    listener.hear(Goal(name="tea", scene=GOAL, pddl=""))
+    told = listener.told()
+    assert (told.actions, told.cards[0].actions, told.doing.text) == ((), (), "The robot follows its script")
+
+
+def test_a_graph_without_objects_has_no_story() -> None:
+    with pytest.raises(Refused, match="story: none of the stages camera has a setting `catalogue`; objects need one"):
+        Story({"camera": {}})
+
+
+# ------------------------------------------------------------------------------------------ languages
+
+
+def test_both_languages_say_the_same_things_with_the_same_parts() -> None:
+    texts = {language: yaml.safe_load(_file(language).read_text()) for language in LANGUAGES}
+    english, german = texts["en"]["texts"], texts["de"]["texts"]
+    assert english.keys() == german.keys() and texts["en"]["nouns"].keys() == texts["de"]["nouns"].keys()
+    for key, text in english.items():
+        assert _parts(text) == _parts(german[key]), key
+    said = {
+        key
+        for path in Path(words.__file__).parent.glob("*.py")
+        for key in re.findall(r'say\("(\w+)"', path.read_text())
+    }
+    assert said <= english.keys()
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_object_of_our_catalogue_has_a_name(language: Language) -> None:
+    nouns = yaml.safe_load(_file(language).read_text())["nouns"]
+    assert {"table", *Catalogue.load(BUILT_IN).objects} == nouns.keys()
+
+
+def test_names_are_bent_counted_and_found_for_what_is_not_known() -> None:
+    german, english = words_of("de"), words_of("en")
+    assert (
+        f"{german.noun('tray')}, {german.noun('tray'):dat}, {german.noun('mug'):acc}"
+        == "das Tablett, dem Tablett, den Becher"
+    )
+    assert [format(words.noun("cup_2")) for words in (english, german)] == ["the cup 2", "die Tasse 2"]
+    assert [format(words.noun("obj_000005"), "dat") for words in (english, german)] == [
+        "the obj 000005",
+        "„obj“ 000005",
+    ]
+    assert [words.bare("power_drill") for words in (english, german)] == ["power drill", "„power drill“"]
+    assert f"{german.nouns(['cup', 'tray', 'mug']):dat}" == "der Tasse, dem Tablett und dem Becher"
+
+
+def _file(language: str) -> Path:
+    return Path(words.__file__).with_name(f"{language}.yaml")
+
+
+def _parts(text: str) -> set[str | None]:
+    return {name for _, name, *_ in string.Formatter().parse(text) if name}

@@ -1,0 +1,74 @@
+"""The robot on its page: a goal is shown, an object moved, the restoring stopped, by mouse and keyboard alone."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from runner.testing import finish, read_until, runner, start_graph
+from tests.runner.page.browser import browser, faults, opened
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    process = start_graph(ROOT / "graphs" / "interactive.yaml", "world.seed=1", folder=tmp_path, options=["--page"])
+    printed = read_until(process, "processes are ready")
+    (url,) = re.findall(r"page: (\S+)", printed)
+    with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
+        teaches(page)
+        listed = runner("goals").communicate(timeout=60)[0]
+        assert (
+            listed.startswith("breakfast\n    6 objects: the ")
+            and "runner call demonstrator restore name=breakf" in listed
+        )
+        restores_and_stops(page)
+        tells_it_in_german(page)
+    process.terminate()
+    run = finish(process, tmp_path, before=printed)
+    assert "COMPLETE" in run.output
+
+
+def teaches(page: Page) -> None:
+    page.get_by_label("Name of the scene").fill("breakfast")
+    page.get_by_role("button", name="Remember this scene").press("Enter")
+    expect(page.locator(".doing")).to_contain_text("“breakfast” is remembered: ")
+    names = page.locator(".picture .name")
+    expect(names).to_have_count(6)
+    assert {text.partition(" ")[2] for text in names.all_inner_texts()} == {
+        *("tray", "cup", "tea box", "tuna can", "milk carton", "sugar box")
+    }
+    expect(page.get_by_role("region", name="What is there").get_by_role("listitem")).to_have_count(6)
+    assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth === 640)")
+    assert faults(page) == []
+
+
+def restores_and_stops(page: Page) -> None:
+    page.get_by_role("button", name="cup", exact=True).focus()
+    for key in [*["ArrowDown"] * 5, "Enter"]:
+        page.keyboard.press(key)
+    expect(page.get_by_text("What the robot saw before something was moved")).to_be_visible()
+    page.get_by_role("button", name="Restore").click()
+    expect(page.locator(".what")).to_have_text("Puts the cup on the table")
+    expect(page.get_by_text(re.compile(r"^Step 1 of \d"))).to_be_visible()
+    expect(page.get_by_role("button", name="Restore")).to_be_disabled()
+    page.keyboard.press("Escape")
+    expect(page.get_by_text("Finishes this, then stops")).to_be_visible()
+    expect(page.get_by_text("Stopped, as you asked.")).to_be_visible()
+    expect(page.get_by_role("button", name="Restore")).to_be_enabled()
+
+
+def tells_it_in_german(page: Page) -> None:
+    page.get_by_label("Language").select_option("de")
+    page.get_by_role("button", name="Noch einmal hinsehen").click()
+    expect(page.get_by_text("Erkennt, was da ist")).to_be_visible()
+    expect(page.get_by_text("Der Roboter wartet auf Sie")).to_be_visible()
+    expect(page.get_by_text("Das Tablett ist auf dem Tisch.")).to_be_visible()
+    page.get_by_role("link", name="Verlauf").click()
+    expect(page.get_by_text("wird geschrieben")).to_be_visible()
