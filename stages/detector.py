@@ -118,14 +118,7 @@ class ModelDetector(Stage):
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("error")
         self._config = config
-        catalogue = Catalogue.shared(config.catalogue)
-        views = Views.load(config.learned) if config.learned else Views.cached(catalogue)
-        if set(views.labels) != set(catalogue.objects):
-            raise Refused(
-                f"detector.learned: {config.learned} has the views of {', '.join(views.labels)}, but the objects of "
-                f"{config.catalogue} are {', '.join(catalogue.objects)}; learn the catalogue again"
-            )
-        self._proposer = Proposer(views)
+        self._proposer = Proposer(Views.of(config.catalogue, config.learned, place="detector.learned"))
 
     def on_frame(self, frame: Frame, ctx: Context) -> Candidates:
         """The frame's candidates, most confident first."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Context, Level, Message, Refused
+from stages.appraiser import Appraiser
 from stages.detector import Detector
 from stages.geometry.arrays import Floats
 from stages.hypotheses import Hypotheses
@@ -133,6 +134,8 @@ class SceneEstimator:
     filters: Filters
     ranker: Ranker
     refiner: Refiner
+    appraiser: Appraiser | None = None
+    """For candidates that come from meshes."""
 
     def messages(self, frame: Frame, candidates: Candidates, ctx: Context) -> Iterator[Message]:
         """Everything that the stages say of one image; the ranked scene and, last, the same scene refined."""
@@ -141,7 +144,10 @@ class SceneEstimator:
         yield from prospects
         sightings = self.filters.look(prospects, observation)
         yield from sightings
-        hypotheses = list(self.hypotheses.on_sightings(sightings, candidates, ctx))
+        if self.appraiser is not None:
+            sightings = list(self.appraiser.on_sightings(sightings, observation, ctx))
+            yield from sightings
+        hypotheses = list(self.hypotheses.on_sightings(sightings, ctx))
         yield from hypotheses
         posteriors = self.filters.estimate(hypotheses, observation)
         yield from posteriors
