@@ -26,10 +26,10 @@ _SMALLEST = 60
 _HIDES = 0.03
 """Metres in front of the surface at which a reading belongs to something that hides it."""
 _ODDS = 3.7
-_FIRST, _SECOND, _DEPTH = 1.4, 3.1, 12.6
-_EXPLAINED = 0.8
+_FIRST, _SECOND, _DEPTH = 1.4, 3.1, 12.5
+EXPLAINED = 0.8
 """Log-odds that an object is there with this label: the odds of both judgements, and the share of the readings that it
-covers which it explains, from this share on. Fitted (docs/perception/candidates.md)."""
+covers which it explains, from this share on. `python -m benchmarks.appraisal` fits it."""
 _CERTAIN = 5.0
 """Log-odds beyond which a judgement is as good as any."""
 
@@ -56,9 +56,9 @@ def second_confidences(judge: Judge, rgb: Bytes, regions: Sequence[Region | None
 
 def appraisal(first: Floats, second: Floats, explained: Floats) -> Appraisal:
     """Of confidences before and after the look, and the shares of what objects cover that they explain; N each."""
-    appearance = _ODDS + _FIRST * _log_odds(first) + _SECOND * _log_odds(second)
-    odds = appearance + _DEPTH * (np.clip(explained, 0, 1) - _EXPLAINED)
-    return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_CERTAIN, _CERTAIN))), _EXPLAINED - appearance / _DEPTH)
+    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second)
+    odds = appearance + _DEPTH * (np.clip(explained, 0, 1) - EXPLAINED)
+    return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_CERTAIN, _CERTAIN))), EXPLAINED - appearance / _DEPTH)
 
 
 def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Floats) -> Region | None:
@@ -97,6 +97,7 @@ def visible_box(region: Region) -> Floats:
     return np.tile(region.box[:2], 2) + np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
 
 
-def _log_odds(confidence: Floats) -> Floats:
+def log_odds(confidence: Floats) -> Floats:
+    """Natural log-odds, bounded."""
     with np.errstate(divide="ignore"):
         return np.clip(np.log(confidence) - np.log1p(-confidence), -_CERTAIN, _CERTAIN)
