@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from runner.contract import Context, Level, Message, Refused
 from stages.appraiser import Appraiser
-from stages.detector import Detector
+from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
 from stages.hypotheses import Hypotheses
 from stages.messages import (
@@ -102,13 +102,15 @@ def estimate_scene(
     """
     path = Path(catalogue)
     frame = _frame(rgb, depth, K, T_base_camera)
+    appraiser = None
     if boxes is None:
         candidates = (detector or _network(path)).on_frame(frame, Quiet())
+        appraiser = _appraiser(path, detector.config.learned) if isinstance(detector, ModelDetector) else None
     else:
         candidates = _candidates(boxes, Catalogue.shared(path))
     hypotheses, filters, refiner, builder = _stages(path, n_objects, dof, device)
     # A ranker of its own: no name depends on an image before.
-    estimator = SceneEstimator(hypotheses, filters, Ranker(Ranker.Config()), refiner)
+    estimator = SceneEstimator(hypotheses, filters, Ranker(Ranker.Config()), refiner, appraiser)
     *_, final = estimator.messages(frame, candidates, Quiet())
     assert isinstance(final, SceneEstimate)
     return EstimatedScene(final, builder.on_scene_estimate(final))
@@ -200,6 +202,12 @@ def _stages(
         Refiner(Refiner.Config(catalogue=catalogue, dof=dof)),
         SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=catalogue)),
     )
+
+
+@lru_cache(maxsize=4)
+def _appraiser(catalogue: Path, learned: Path | None) -> Appraiser:
+    """Judges what the detector by meshes finds."""
+    return Appraiser(Appraiser.Config(catalogue=catalogue, learned=learned))
 
 
 @lru_cache(maxsize=4)
