@@ -38,7 +38,9 @@ _OVERLAP = 0.3
 """A box that overlaps a true one of its label by more, of an object that was found elsewhere, is neither right nor
 wrong."""
 _RIDGE = 0.3
-TERMS = ("before the look", "within the silhouette", "explained")
+_STEP = 0.2
+"""Of the share that is explained: what counts as one unit, so that the ridge weighs on all terms alike."""
+TERMS = ("before the look", "within the silhouette", "explained, a fifth")
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def cases(dataset: Path, without: Sequence[str], learned: Path | None) -> Iterat
             touches = intersection_over_union(candidate.box[None], boxes).max(initial=0.0) > _OVERLAP
             if candidate.label not in without and (right or not touches):
                 odds = log_odds(np.array([candidate.confidence, again]))
-                yield Case(sensors[image.id], np.array([1.0, *odds, start.explained - EXPLAINED]), right)
+                yield Case(sensors[image.id], np.array([1.0, *odds, (start.explained - EXPLAINED) / _STEP]), right)
 
 
 def _looked(
