@@ -38,6 +38,9 @@ from stages.scene.metrics import (
 
 _POINTS = 2000
 _FLIP = np.deg2rad(15.0)
+_SURE = 0.9
+_SHOWN = 1 / 3
+"""Of an object's silhouette that must be seen for it to count where nobody gave boxes."""
 _WORST = np.ones(len(BOP_SHARES))
 
 Views = Mapping[ImageId, tuple[Depth, Intrinsics]]
@@ -152,6 +155,27 @@ def right_sets(truths: Sequence[Truth], results: Sequence[Result]) -> tuple[int,
     return sum(f == w for f, w in zip(found, wanted, strict=True)), len(images)
 
 
+@dataclass(frozen=True)
+class Claims:
+    """What results say beyond the objects that are there."""
+
+    false: int
+    """Results of which no object of their label is left in their image."""
+    sure: int
+    """Results called right with a probability of 0.9 and more; false ones count."""
+    sure_right: int
+    """Of these within 2 cm and 15 degrees."""
+    images: int
+
+    @staticmethod
+    def of(scores: Sequence[Score], results: Sequence[Result]) -> Claims:
+        """Those of results that were scored."""
+        matched = [(one, one.result) for one in scores if one.result is not None]
+        sure = sum(result.score >= _SURE for result in results)
+        right = sum(result.score >= _SURE and one.within(0.02, 15) for one, result in matched)
+        return Claims(len(results) - len(matched), sure, right, len({one.truth.image for one in scores}))
+
+
 BOUNDS: dict[str, Callable[[Score], bool]] = {
     "ADD-S < 1 cm": lambda one: one.adds < 0.01,
     "ADD-S < 2 cm": lambda one: one.adds < 0.02,
@@ -179,7 +203,7 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     return max(0.0, float(low)), min(1.0, float(high))
 
 
-def table(scores: Sequence[Score], sets: tuple[int, int]) -> str:
+def table(scores: Sequence[Score], sets: tuple[int, int], claims: Claims | None = None) -> str:
     """The summary that people read."""
     lines = [_line(name, sum(map(hit, scores)), len(scores)) for name, hit in BOUNDS.items()]
     known = [one for one in scores if one.truth.label_known]
@@ -187,6 +211,11 @@ def table(scores: Sequence[Score], sets: tuple[int, int]) -> str:
     lines += [f"{name:22s} {100 * value:5.1f} %" for name, value in recalls(scores).items()]
     lines.append(f"{'near-symmetric flips':22s} {sum(one.flip for one in scores)} (counted as errors above)")
     lines.append(f"{'set of objects right':22s} {sets[0]} of {sets[1]} images")
+    if claims is not None:
+        shown = [one for one in scores if one.truth.visible >= _SHOWN]
+        lines.append(_line("2 cm, 15 deg, a third", sum(one.within(0.02, 15) for one in shown), len(shown)))
+        lines.append(_line("right of those sure", claims.sure_right, claims.sure))
+        lines.append(f"{'false objects':22s} {claims.false} in {claims.images} images")
     return "\n".join(lines)
 
 
@@ -266,7 +295,7 @@ def main() -> int:
     if arguments.json:
         print(json.dumps(as_json(scores, sets), indent=1))
     else:
-        print(table(scores, sets))
+        print(table(scores, sets, Claims.of(scores, results)))
         print(failures(scores, catalogue))
     return 0
 

@@ -42,7 +42,7 @@ class Sheet:
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._items = {item.label: item for item in catalogue.objects.values()}
-        self._renderer: Renderer | None = None
+        self._renderers: dict[tuple[int, int], Renderer] = {}
 
     def draw(self, failures: Sequence[tuple[Image, Score]], results: Sequence[Result]) -> Picture.Image:
         """All failures; ``results`` are drawn around the one in question."""
@@ -109,13 +109,11 @@ class Sheet:
         return int(x0), int(y0), int(x0 + 2 * half), int(y0 + 2 * half)
 
     def _of(self, image: Image) -> Renderer:
-        """A renderer of the image's size; sizes hardly ever change within a data set."""
+        """A renderer of the image's size; a data set has few sizes."""
         height, width = image.depth.shape
-        if self._renderer is None or (self._renderer.width, self._renderer.height) != (width, height):
-            if self._renderer is not None:
-                self._renderer.close()
-            self._renderer = Renderer(width, height)
-        return self._renderer
+        if (width, height) not in self._renderers:
+            self._renderers[width, height] = Renderer(width, height)
+        return self._renderers[width, height]
 
 
 def _camera(image: Image) -> Camera:

@@ -117,15 +117,8 @@ class ModelDetector(Stage):
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("error")
-        self._config = config
-        catalogue = Catalogue.shared(config.catalogue)
-        views = Views.load(config.learned) if config.learned else Views.cached(catalogue)
-        if set(views.labels) != set(catalogue.objects):
-            raise Refused(
-                f"detector.learned: {config.learned} has the views of {', '.join(views.labels)}, but the objects of "
-                f"{config.catalogue} are {', '.join(catalogue.objects)}; learn the catalogue again"
-            )
-        self._proposer = Proposer(views)
+        self.config = config
+        self._proposer = Proposer(Views.of(config.catalogue, config.learned, place="detector.learned"))
 
     def on_frame(self, frame: Frame, ctx: Context) -> Candidates:
         """The frame's candidates, most confident first."""
@@ -133,11 +126,11 @@ class ModelDetector(Stage):
         if frame.robot_mask is not None:
             depth[frame.robot_mask] = _FAR
         up = None if frame.T_base_camera is None else frame.T_base_camera[2, :3]
-        found = self._proposer.propose(frame.rgb, depth, frame.K, ctx.rng, up=up, most=self._config.max_candidates)
+        found = self._proposer.propose(frame.rgb, depth, frame.K, ctx.rng, up=up, most=self.config.max_candidates)
         labels = self._proposer.labels
         rows = zip(found.boxes, found.labels, found.confidences, strict=True)
         candidates = tuple(Candidate(box=box, label=labels[k], confidence=float(row[k])) for box, k, row in rows)
-        kept = [i for i, candidate in enumerate(candidates) if candidate.confidence >= self._config.floor]
+        kept = [i for i, candidate in enumerate(candidates) if candidate.confidence >= self.config.floor]
         message = Candidates(
             candidates=tuple(candidates[i] for i in kept), labels=labels, confidences=found.confidences[kept]
         )

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Context, Level, Message, Refused
-from stages.detector import Detector
+from stages.appraiser import Appraiser
+from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
 from stages.hypotheses import Hypotheses
 from stages.messages import (
@@ -102,13 +103,15 @@ def estimate_scene(
     """
     path = Path(catalogue)
     frame = _frame(rgb, depth, K, T_base_camera)
+    appraiser = None
     if boxes is None:
         candidates = (detector or _network(path)).on_frame(frame, Quiet())
+        appraiser = _appraiser(path, detector.config.learned) if isinstance(detector, ModelDetector) else None
     else:
         candidates = _candidates(boxes, Catalogue.shared(path))
     hypotheses, filters, refiner, builder = _stages(path, n_objects, dof, device)
     # A ranker of its own: no name depends on an image before.
-    estimator = SceneEstimator(hypotheses, filters, Ranker(Ranker.Config()), refiner)
+    estimator = SceneEstimator(hypotheses, filters, Ranker(Ranker.Config()), refiner, appraiser)
     *_, final = estimator.messages(frame, candidates, Quiet())
     assert isinstance(final, SceneEstimate)
     return EstimatedScene(final, builder.on_scene_estimate(final))
@@ -134,6 +137,8 @@ class SceneEstimator:
     filters: Filters
     ranker: Ranker
     refiner: Refiner
+    appraiser: Appraiser | None = None
+    """For candidates that come from meshes."""
 
     def messages(self, frame: Frame, candidates: Candidates, ctx: Context) -> Iterator[Message]:
         """Everything that the stages say of one image; the ranked scene and, last, the same scene refined."""
@@ -142,7 +147,10 @@ class SceneEstimator:
         yield from prospects
         sightings = self.filters.look(prospects, observation)
         yield from sightings
-        hypotheses = list(self.hypotheses.on_sightings(sightings, candidates, ctx))
+        if self.appraiser is not None:
+            sightings = list(self.appraiser.on_sightings(sightings, observation, ctx))
+            yield from sightings
+        hypotheses = list(self.hypotheses.on_sightings(sightings, ctx))
         yield from hypotheses
         posteriors = self.filters.estimate(hypotheses, observation)
         yield from posteriors
@@ -195,6 +203,12 @@ def _stages(
         Refiner(Refiner.Config(catalogue=catalogue, dof=dof)),
         SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=catalogue)),
     )
+
+
+@lru_cache(maxsize=4)
+def _appraiser(catalogue: Path, learned: Path | None) -> Appraiser:
+    """Judges what the detector by meshes finds."""
+    return Appraiser(Appraiser.Config(catalogue=catalogue, learned=learned))
 
 
 @lru_cache(maxsize=4)

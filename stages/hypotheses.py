@@ -21,10 +21,20 @@ from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
 from stages.perception.observation.preprocessing import preprocess
 
-OBJECT_COST = 0.1
-"""With N_c unknown an object must explain a tenth of what readings all over its box would cost, as far above the plane
-as it rises: what is there explains a fifth at least, even where its box is loose; what is not there, or there already,
-next to nothing."""
+
+@dataclass(frozen=True)
+class _Found:
+    """A candidate and what the look at it alone found."""
+
+    candidate: Candidate
+    start: Start
+    glimpse: Glimpse
+    share: float
+
+    @property
+    def charge(self) -> float:
+        """What the object costs by being there."""
+        return charge(self.candidate.box, self.start, self.share)
 
 
 class Hypotheses(Stage):
@@ -67,26 +77,15 @@ class Hypotheses(Stage):
         for index, candidate in enumerate(prospects):
             yield Prospect(index=index, count=len(prospects), candidate=candidate, n_objects=number)
 
-    def on_sightings(self, sightings: list[Sighting], detected: Candidates, ctx: Context) -> Iterator[Hypothesis]:
+    def on_sightings(self, sightings: list[Sighting], ctx: Context) -> Iterator[Hypothesis]:
         """h hypotheses, the cheapest (in the paper's plain form the most confident) combination first."""
-        candidates = ordered(detected.candidates)
-        glimpses = [sighting.glimpse for sighting in sightings if sighting.glimpse is not None]
-        starts = [sighting.start for sighting in sightings if sighting.start is not None]
         number = sightings[0].n_objects
-        if len(starts) < len(candidates) or not candidates:
-            yield from self._most_confident(candidates, number, ctx)
+        found = [_Found(s.candidate, s.start, s.glimpse, s.share) for s in sightings if s.candidate is not None
+                 and s.start is not None and s.glimpse is not None]  # fmt: skip
+        if found:
+            yield from self._cheapest(_distinct(found, ctx), number, ctx)
         else:
-            kept = self._distinct(candidates, starts, ctx)
-            chosen, starts, glimpses = ([each[i] for i in kept] for each in (candidates, starts, glimpses))
-            yield from self._cheapest(chosen, starts, glimpses, number, ctx)
-
-    def _distinct(self, candidates: list[Candidate], starts: list[Start], ctx: Context) -> list[int]:
-        """The candidates that show no object which a more confident one shows."""
-        labels, boxes = [item.label for item in candidates], [item.box for item in candidates]
-        kept = distinct(labels, boxes, [start.T_camera_object[:3, 3] for start in starts])
-        if len(kept) < len(candidates):
-            ctx.log(f"{len(candidates) - len(kept)} of {len(candidates)} candidates show an object once more: left out")
-        return kept
+            yield from self._most_confident([s.candidate for s in sightings if s.candidate is not None], number, ctx)
 
     def _most_confident(self, candidates: list[Candidate], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
         if number is None and candidates:
@@ -101,32 +100,31 @@ class Hypotheses(Stage):
         for index, combination in enumerate(combinations):
             yield Hypothesis(index=index, count=len(combinations), candidates=combination, left_out=left_out)
 
-    def _cheapest(
-        self, candidates: list[Candidate], starts: list[Start], glimpses: list[Glimpse], number: int | None,
-        ctx: Context,
-    ) -> Iterator[Hypothesis]:  # fmt: skip
-        object_cost = 0.0 if number is not None else OBJECT_COST
-        charges = [charge([c.box], [start.rise], object_cost) for c, start in zip(candidates, starts, strict=True)]
-        look = FirstLook(glimpses, charges)
-        h = count_subsets(len(candidates), number)
-        ranked = cheapest(look.cost, len(candidates), number, h)
+    def _cheapest(self, found: list[_Found], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
+        if number is None:
+            found = _not_refuted(found, ctx)
+        charges = [each.charge if number is None else 0.0 for each in found]
+        look = FirstLook([each.glimpse for each in found], charges)
+        h = count_subsets(len(found), number)
+        ranked = cheapest(look.cost, len(found), number, h)
         combinations = (ranked if number is not None else additions_first(ranked))[: self.config.finalists]
         left_out = h - len(combinations)
         if left_out:
             ctx.log(_left_out(len(combinations), left_out, "dearest at first look", "finalists"))
         incumbent = tuple(
-            Placed(candidate=candidates[i], T_camera_object=starts[i].T_camera_object, rise=starts[i].rise)
+            Placed(candidate=found[i].candidate, T_camera_object=found[i].start.T_camera_object)
             for i in combinations[0]
         )
         for index, chosen in enumerate(combinations):
             yield Hypothesis(
                 index=index,
                 count=len(combinations),
-                candidates=tuple(candidates[i] for i in chosen),
+                candidates=tuple(found[i].candidate for i in chosen),
                 left_out=left_out,
-                starts=tuple(starts[i] for i in chosen),
+                starts=tuple(found[i].start for i in chosen),
                 incumbent=incumbent,
-                object_cost=object_cost,
+                charged=sum(charges[i] for i in chosen),
+                incumbent_charged=sum(charges[i] for i in combinations[0]),
             )
 
     def _n_objects(self, frame: Frame) -> int | None:
@@ -140,6 +138,24 @@ class Hypotheses(Stage):
             f"{frame.name}: the number of objects is not known; set hypotheses.n_objects to a whole number or auto, or "
             "use a data set with a targets file"
         )
+
+
+def _distinct(found: list[_Found], ctx: Context) -> list[_Found]:
+    """Those that show no object that a more confident one shows, the most confident first."""
+    found = sorted(found, key=lambda each: -each.candidate.confidence)
+    labels, boxes = [each.candidate.label for each in found], [each.candidate.box for each in found]
+    kept = distinct(labels, boxes, [each.start.T_camera_object[:3, 3] for each in found])
+    if len(kept) < len(found):
+        ctx.log(f"{len(found) - len(kept)} of {len(found)} candidates show an object once more: left out")
+    return [found[i] for i in kept]
+
+
+def _not_refuted(found: list[_Found], ctx: Context) -> list[_Found]:
+    """Those of which no more is asked than to explain all that they cover."""
+    kept = [each for each in found if each.share < 1]
+    if len(kept) < len(found):
+        ctx.log(f"{len(found) - len(kept)} of {len(found)} candidates do not look like what they are called: left out")
+    return kept
 
 
 def _left_out(kept: int, left_out: int, which: str, setting: str) -> str:

@@ -18,7 +18,6 @@ from stages.perception.cuda.device import DEVICES, chosen_device
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.particle_filter import Track
 from stages.perception.filter.settings import FilterSettings
-from stages.perception.hypotheses.composition import charge
 from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
 from stages.scene.catalogue import Catalogue
 from stages.scene.naming import unique_names
@@ -80,25 +79,28 @@ class ParticleFilter(Stage):
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
         """A look at one candidate alone, where the form takes one."""
         candidate = prospect.candidate
-        nothing = Sighting(index=prospect.index, count=prospect.count, n_objects=prospect.n_objects)
+        nothing = Sighting(
+            index=prospect.index, count=prospect.count, n_objects=prospect.n_objects, candidate=candidate
+        )
         if candidate is None or not self._filter.looks_first:
             return nothing
         scene, suspect = _scene(view), _suspect(candidate)
         track = self._filter.look(scene, suspect, among=prospect.count)
         start = Start(T_camera_object=_pose(track), trace=_trace(track))
-        if prospect.n_objects is None:
-            start = msgspec.structs.replace(start, rise=self._filter.rise(scene, suspect, track))
-        return msgspec.structs.replace(nothing, start=start, glimpse=self._filter.glimpse(scene, suspect, track))
+        unknown = prospect.n_objects is None
+        if unknown:
+            rise, claim, explained = self._filter.worth(scene, suspect, track)
+            start = msgspec.structs.replace(start, rise=rise, claim=claim, explained=explained)
+        return msgspec.structs.replace(
+            nothing, start=start, glimpse=self._filter.glimpse(scene, suspect, track, anywhere=unknown)
+        )
 
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
         """The most likely scene of the hypothesis and its unnormalised weight."""
         scene = _scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
-        rises = [start.rise for start in hypothesis.starts]
-        # Without first looks N_c is known, and nothing is charged.
-        charged = charge([s.box for s in suspects], rises, hypothesis.object_cost) if hypothesis.object_cost else 0.0
-        reached = self._reached(scene, hypothesis, charged)
+        reached = self._reached(scene, hypothesis)
         result = self._filter.estimate(scene, suspects, starts, reached=reached)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
@@ -108,22 +110,21 @@ class ParticleFilter(Stage):
             index=hypothesis.index,
             count=hypothesis.count,
             objects=tuple(_object(*each) for each in objects),
-            log_weight=-self.config.lambda_r * (result.cost + charged),
+            log_weight=-self.config.lambda_r * (result.cost + hypothesis.charged),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
             lambda_r=self.config.lambda_r,
         )
 
-    def _reached(self, scene: ObservedScene, hypothesis: Hypothesis, charged: float) -> float:
-        """What a scene whose objects are ``charged`` so much may cost and still weigh as much as the known one."""
+    def _reached(self, scene: ObservedScene, hypothesis: Hypothesis) -> float:
+        """What a scene of the hypothesis may cost and still weigh as much as the known one."""
         if not hypothesis.starts:
             return np.inf
         suspects = [_suspect(placed.candidate) for placed in hypothesis.incumbent]
-        rises = [placed.rise for placed in hypothesis.incumbent]
         poses = [placed.T_camera_object[:3] for placed in hypothesis.incumbent]
         # For the incumbent itself the charges cancel exactly.
-        difference = charge([suspect.box for suspect in suspects], rises, hypothesis.object_cost) - charged
+        difference = hypothesis.incumbent_charged - hypothesis.charged
         return self._filter.begun_cost(scene, suspects, poses) + difference
 
 

@@ -101,7 +101,8 @@ class Pipeline:
         made: dict[str, Any] = {name: graph.nodes[name].construct() for name in STAGES if name != "particle_filter"}
         self._pooled = None if pool is None else PooledFilters(pool)
         filters = self._pooled or FiltersHere(constructed_filter(graph))
-        self._estimator = SceneEstimator(made["hypotheses"], filters, made["ranker"], made["refiner"])
+        appraiser: Any = graph.nodes["appraiser"].construct() if "appraiser" in graph.nodes else None
+        self._estimator = SceneEstimator(made["hypotheses"], filters, made["ranker"], made["refiner"], appraiser)
 
     def estimate(self, image: Image) -> Estimate:
         """The scene of one image; random numbers are those of a run over the whole data set."""

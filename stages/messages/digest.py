@@ -66,6 +66,14 @@ class Start(Struct, frozen=True, kw_only=True):
     rise: float = 0.03
     """Metres by which what it shows stands out of the plane, on average, along the ray and bounded; asked for where N_c
     is not known."""
+    claim: float = 0.0
+    """What the readings that it covers cost if nothing explains them, metres times pixels; asked for likewise."""
+    explained: float = 0.0
+    """Share of its claim that it explains; asked for likewise."""
+
+
+GLIMPSE_STRIDE = 2
+"""Glimpses keep every second pixel of every second row."""
 
 
 class Glimpse(Struct, frozen=True, kw_only=True):
@@ -84,6 +92,10 @@ class Sighting(Part, frozen=True, kw_only=True):
     """What the look at one candidate alone found; nothing in the paper's plain form, which takes none."""
 
     n_objects: int | None
+    candidate: Candidate | None = None
+    """What was looked at; None in the one part of a frame without candidates."""
+    share: float = 0.1
+    """With N_c unknown the object must explain so much of what it claims: a tenth, or what an appraisal asks for."""
     start: Start | None = None
     glimpse: Glimpse | None = None
 
@@ -93,8 +105,6 @@ class Placed(Struct, frozen=True, kw_only=True):
 
     candidate: Candidate
     T_camera_object: Pose
-    rise: float = 0.03
-    """As its start has it."""
 
 
 class Hypothesis(Part, frozen=True, kw_only=True):
@@ -107,9 +117,10 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     """Of each candidate, where there were looks at each alone."""
     incumbent: tuple[Placed, ...] = ()
     """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
-    object_cost: float = 0.0
-    """Every object adds this share of what readings all over its box would cost, as far as it rises from the plane; 0
-    where N_c is known."""
+    charged: float = 0.0
+    """What its objects cost by being there, metres times pixels; 0 where N_c is known."""
+    incumbent_charged: float = 0.0
+    """Likewise of the incumbent's."""
 
 
 class Posterior(Part, frozen=True, kw_only=True):

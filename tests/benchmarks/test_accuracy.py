@@ -46,10 +46,11 @@ def test_the_command_prints_a_table_or_json(
 ) -> None:
     csv = dataset / "half.csv"
     lines = [result.line() for result in results_of(dataset, shift=0.0)]
-    csv.write_text("\n".join([HEADER, *lines[1:]]) + "\n")
+    csv.write_text("\n".join([HEADER, *lines[1:], lines[-1]]) + "\n")
     monkeypatch.setattr(sys, "argv", ["accuracy", str(dataset), str(csv)])
     assert accuracy.main() == 0
     printed = capsys.readouterr().out
+    assert "false objects          1 in 1 images" in printed and f"({len(lines) - 1} of {len(lines)})" in printed
     assert "2 cm and 15 degrees" in printed and "not found" in printed and "set of objects right   0 of 1" in printed
     monkeypatch.setattr(sys, "argv", ["accuracy", str(dataset), str(csv), "--json"])
     assert accuracy.main() == 0

@@ -65,11 +65,13 @@ def enumerate_(
         for each in prospects
         if isinstance(each, Prospect)
     ]
-    return [observation, *stage.on_sightings(sightings, found, ctx)], ctx
+    return [observation, *stage.on_sightings(sightings, ctx)], ctx
 
 
 def blind(prospect: Prospect) -> Sighting:
-    return Sighting(index=prospect.index, count=prospect.count, n_objects=prospect.n_objects)
+    return Sighting(
+        index=prospect.index, count=prospect.count, n_objects=prospect.n_objects, candidate=prospect.candidate
+    )
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,6 +24,16 @@ _FILLED = 0.92
 _GREY = 127
 _CHROMA, _LIGHT = 12, 6
 """Bins of the histograms, of a and b each, and of lightness."""
+
+
+class Piece(NamedTuple):
+    """A piece of an image, scaled into a square of SIDE pixels, grey around it."""
+
+    crop: Bytes
+    mask: Mask
+    """Where it is seen."""
+    whole: Mask
+    """Where it is, seen or hidden."""
 
 
 @dataclass(frozen=True)
@@ -45,30 +56,32 @@ class Looks:
     """N x OUTLINE^2."""
 
     @staticmethod
-    def of(pieces: Sequence[tuple[Bytes, Mask]]) -> Looks:
-        """Of crops and masks as :func:`square` makes them, at least one."""
-        crops, masks = np.stack([crop for crop, _ in pieces]), np.stack([mask for _, mask in pieces])
+    def of(pieces: Sequence[Piece]) -> Looks:
+        """Of at least one piece."""
+        crops, masks, whole = map(np.stack, zip(*pieces, strict=True))
         seen = Backbone.pretrained().features(crops, masks)
-        chroma, light = zip(*(_histograms(crop[mask]) for crop, mask in pieces), strict=True)
-        outline = np.stack([_outline(mask) for mask in masks])
+        chroma, light = zip(*(_histograms(piece.crop[piece.mask]) for piece in pieces), strict=True)
+        outline = np.stack([_outline(mask) for mask in whole])
         return Looks(seen.middle, seen.last, seen.grid, seen.covered, np.stack(chroma), np.stack(light), outline)
 
 
-def square(rgb: Bytes, mask: Mask) -> tuple[Bytes, Mask]:
-    """The mask's own part of an image, scaled into a square of SIDE pixels, grey around it; and its mask there."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+def square(rgb: Bytes, mask: Mask, whole: Mask | None = None) -> Piece:
+    """The mask's own part of an image; ``whole`` also has what is hidden of it, where that is known."""
+    whole = mask if whole is None else whole
+    rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
     window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    height, width = mask[window].shape
+    height, width = whole[window].shape
     scale = SIDE * _FILLED / max(height, width)
     size = max(2, round(width * scale)), max(2, round(height * scale))
     area = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(np.ascontiguousarray(rgb[window]), size, interpolation=area)
-    shape = cv2.resize(mask[window].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     y, x = (SIDE - size[1]) // 2, (SIDE - size[0]) // 2
-    crop, inside = np.full((SIDE, SIDE, 3), _GREY, np.uint8), np.zeros((SIDE, SIDE), bool)
-    inside[y : y + size[1], x : x + size[0]] = shape
-    crop[inside] = small[shape]
-    return crop, inside
+    part = np.s_[y : y + size[1], x : x + size[0]]
+    crop, inside, outline = np.full((SIDE, SIDE, 3), _GREY, np.uint8), *np.zeros((2, SIDE, SIDE), bool)
+    for target, source in ((inside, mask), (outline, whole)):
+        target[part] = cv2.resize(source[window].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    crop[inside] = small[inside[part]]
+    return Piece(crop, inside, outline)
 
 
 def _histograms(colors: Bytes) -> tuple[Float32s, Float32s]:

@@ -42,7 +42,7 @@ class Judge:
 
     def scores(self, regions: Sequence[Region], rgb: Bytes) -> Floats:
         """How much each region looks like the best view of each label, N x L; N > 0."""
-        looks = Looks.of([square(_window(rgb, region), region.mask) for region in regions])
+        looks = Looks.of([square(_window(rgb, region), region.mask, region.whole) for region in regions])
         likeness = self._likeness(regions, looks)
         scores = np.empty((len(regions), len(self._of_label)))
         cells = projected(looks.grid, self._views.basis)

@@ -60,10 +60,10 @@ class Proposer:
         found = regions(small, sparse, view, rng, up=up, sizes=self._judge.sizes, most=_REGIONS)
         if not found:
             return Proposals(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros((0, len(self.labels))))
-        return _chosen(found, _confidences(found, self._judge.scores(found, small)), step, most)
+        return _chosen(found, confidences(found, self._judge.scores(found, small)), step, most)
 
 
-def _confidences(found: list[Region], scores: Floats) -> Floats:
+def confidences(found: list[Region], scores: Floats) -> Floats:
     """v(L_j | B_i): softmax over the labels and one class for everything else."""
     outline = np.array([region.objectness for region in found])[:, None]
     strength = np.exp((scores + _OUTLINE * outline - _BACKGROUND) / _SHARPNESS)

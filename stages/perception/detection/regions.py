@@ -49,7 +49,7 @@ class Region:
     box: Floats
     """x0, y0, x1, y1 in pixels, exclusive."""
     mask: Mask
-    """Of the box' pixels those that belong to it."""
+    """Of the box' pixels those that belong to it and are seen."""
     objectness: float
     """How much of its outline lies on edges, 0 to 2.3."""
     hidden: bool
@@ -60,6 +60,8 @@ class Region:
     """Degrees above its plane's horizon from which it is seen; NaN without a plane."""
     top: float
     """Metres above its plane; NaN without one."""
+    whole: Mask | None = None
+    """Of the box' pixels those that belong to it whether seen or not, where that is known; else as ``mask``."""
 
 
 @dataclass(frozen=True)
@@ -230,12 +232,12 @@ def _region(picture: _Picture, pieces: Pieces, support: Support | None, *, index
         objectness=score,
         hidden=bool(cut or pieces.outline[index, 2] > _HIDDEN),
         extent=((x1 - x0) * metres, (y1 - y0) * metres),
-        elevation=np.nan if support is None else _elevation(ray, support.normal),
+        elevation=np.nan if support is None else elevation_of(ray, support.normal),
         top=np.nan if support is None else float(np.percentile(support.height[window][mask], 98)),
     )
 
 
-def _elevation(ray: Floats, normal: Floats) -> float:
+def elevation_of(ray: Floats, normal: Floats) -> float:
     """Degrees above the horizon of a plane from which the camera looks along a ray."""
     return float(np.rad2deg(np.arcsin(np.clip(-(ray * normal).sum() / np.sqrt((ray**2).sum()), -1, 1))))
 

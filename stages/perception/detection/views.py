@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from safetensors.numpy import save_file
 
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
-from stages.perception.detection.appearance import Bytes, Float32s, Looks, Mask, square
+from stages.perception.detection.appearance import Float32s, Looks, Mask, Piece, square
 from stages.perception.rendering.contact_sheet import looking_at
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
@@ -92,12 +93,31 @@ class Views:
         )
 
     @staticmethod
+    def of(catalogue: Path, learned: Path | None, *, place: str) -> Views:
+        """Those of a catalogue: what a file has of it, or learned now unless that was done before.
+
+        Raises:
+            Refused: the file is of another catalogue; ``place`` names the setting.
+        """
+        objects = Catalogue.shared(catalogue)
+        views = Views.load(learned) if learned else Views.cached(objects)
+        if set(views.labels) != set(objects.objects):
+            raise Refused(
+                f"{place}: {learned} has the views of {', '.join(views.labels)}, but the objects of {catalogue} are "
+                f"{', '.join(objects.objects)}; learn the catalogue again"
+            )
+        return views
+
+    @staticmethod
     def cached(catalogue: Catalogue) -> Views:
         """As :meth:`learn`, but kept in the user's cache folder for the next time."""
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene-programming"
         path = folder / f"views-{_digest(catalogue)}.safetensors"
-        if not path.is_file():
-            Views.learn(catalogue).save(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # Of several processes that begin together one learns.
+            if not path.is_file():
+                Views.learn(catalogue).save(path)
         return Views.load(path)
 
     def save(self, path: Path) -> None:
@@ -166,7 +186,7 @@ def _basis(looks: Looks) -> Float32s:
 
 def _views(
     item: CatalogueObject, renderer: Renderer, azimuths: int
-) -> Iterator[tuple[float, tuple[float, float], float, tuple[Bytes, Mask]]]:
+) -> Iterator[tuple[float, tuple[float, float], float, Piece]]:
     """Elevation, extent, top, crop and mask of every view of an object."""
     middle = item.bounds.mean(0)
     radius = float(np.linalg.norm(item.mesh.vertices - middle, axis=1).max())

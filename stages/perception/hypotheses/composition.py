@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.messages.digest import Glimpse
+from stages.messages.digest import GLIMPSE_STRIDE, Glimpse, Start
 from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
 from stages.perception.filter.particle_filter import pixels
 from stages.perception.rendering.rasteriser import Float32s
 
 REACH = 0.25
 """Share of a candidate's box by which it is grown to where its object may explain readings: boxes are not exact."""
-STRIDE = 2
-"""Glimpses keep every second pixel of every second row."""
+_LEAST = 0.1
+"""With N_c unknown an object must explain this share of what readings all over its box would cost."""
 
 
 class Composition:
@@ -88,15 +88,27 @@ def pixel_costs(
     return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
 
 
-def charge(boxes: Sequence[Floats], rises: Sequence[float], share: float) -> float:
-    """What objects cost by being there, metres times pixels: ``share`` of what their boxes would, were they filled with
-    readings as far from the plane as the objects rise (metres) and nothing explained.
+def charge(box: Floats, start: Start, share: float) -> float:
+    """What an object costs by being there, metres times pixels: it must explain more to be worth having.
 
-    A box frames what is visible of its object, so the object can explain most of it. One that explains less than its
-    share is not worth having: a double of another, or one that is not there.
+    Always a tenth of what its box would cost, were it filled with readings as far from the plane as the object rises
+    and nothing explained: a box frames what is visible of its object, so what is there explains a fifth at least, even
+    where its box is loose; what is not there, or there already, next to nothing. And ``share`` of what it claims.
     """
-    areas = [float(box[2] - box[0]) * float(box[3] - box[1]) for box in boxes]
-    return share * sum(area * rise for area, rise in zip(areas, rises, strict=True))
+    area = float(box[2] - box[0]) * float(box[3] - box[1])
+    return max(_LEAST * area * start.rise, share * start.claim)
+
+
+def claim(scene: ObservedScene, layer: Float32s, form: CostForm) -> tuple[float, float]:
+    """What the readings that an object (H x W inverse depth) covers cost with the plane alone, metres times pixels, and
+    the share of that which it explains. Readings in front of it belong to something else.
+    """
+    silhouette = layer > scene.plane_inverse
+    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
+    covered = silhouette & (scene.factor > 0) & (behind <= form.occluder_margin)
+    claimed = _sum(credits(scene, scene.plane_inverse, form)[covered])
+    left = _sum(np.minimum(np.abs(behind), form.truncation)[covered])
+    return claimed, max(0.0, 1.0 - left / max(claimed, 1e-9))
 
 
 def rise(scene: ObservedScene, layer: Float32s, form: CostForm) -> float:
@@ -129,12 +141,12 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
 def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse
-    kept = shown[::STRIDE, ::STRIDE]
+    kept = shown[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE]
     rows, columns = _extent(kept.sum(1) > 0), _extent(kept.sum(0) > 0)
     composition = Composition(scene, form, [box])
     change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
     part = np.s_[rows.start : rows.stop, columns.start : columns.stop]
-    inverse, change = (np.where(shown, a, 0.0)[::STRIDE, ::STRIDE][part] for a in (layer, change))
+    inverse, change = (np.where(shown, a, 0.0)[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE][part] for a in (layer, change))
     return Glimpse(
         left=columns.start,
         top=rows.start,
@@ -166,7 +178,7 @@ class FirstLook:
             nearer = one.inverse > self._inverse[part]
             np.copyto(self._inverse[part], one.inverse, where=nearer)
             np.copyto(self._change[part], one.change, where=nearer)
-        return _sum(self._change) * STRIDE**2 + sum(self._charges[i] for i in chosen)
+        return _sum(self._change) * GLIMPSE_STRIDE**2 + sum(self._charges[i] for i in chosen)
 
 
 def _extent(kept: NDArray[np.bool_]) -> slice:

@@ -15,7 +15,7 @@ from stages.perception.filter.evolution import CPU, Device
 from stages.perception.filter.likelihood import ObservedScene, with_object
 from stages.perception.filter.particle_filter import ObjectFilter, Task, Track, pixels, run_together
 from stages.perception.filter.settings import FilterSettings
-from stages.perception.hypotheses.composition import Composition, fit, glimpse, rise, scene_cost
+from stages.perception.hypotheses.composition import Composition, claim, fit, glimpse, rise, scene_cost
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue
 
@@ -120,13 +120,17 @@ class SceneFilter:
             self._remember(key, tracks[key])
         return [tracks[key] for key in keys]
 
-    def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Glimpse:
-        """What a track would show, for the first ranking of combinations."""
-        return glimpse(scene, self._layer(scene, suspect, track.T_camera_object), suspect.box, self._settings.cost)
+    def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track, *, anywhere: bool = False) -> Glimpse:
+        """What a track would show, for the first ranking of combinations; ``anywhere`` counts what it explains outside
+        its box too."""
+        height, width = scene.depth.shape
+        box = np.array([0.0, 0.0, width, height]) if anywhere else suspect.box
+        return glimpse(scene, self._layer(scene, suspect, track.T_camera_object), box, self._settings.cost)
 
-    def rise(self, scene: ObservedScene, suspect: Suspect, track: Track) -> float:
-        """How far a track's object stands out of the plane, metres."""
-        return rise(scene, self._layer(scene, suspect, track.T_camera_object), self._settings.cost)
+    def worth(self, scene: ObservedScene, suspect: Suspect, track: Track) -> tuple[float, float, float]:
+        """How far a track's object stands out of the plane, metres, what it claims, and the share that it explains."""
+        layer = self._layer(scene, suspect, track.T_camera_object)
+        return rise(scene, layer, self._settings.cost), *claim(scene, layer, self._settings.cost)
 
     def estimate(
         self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Track] | None = None, *,

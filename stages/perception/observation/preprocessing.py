@@ -32,7 +32,7 @@ def preprocess(
     depth = np.where(working_area(frame, candidates) & measured, frame.depth, np.float32(0))
     view = View.of(frame.K, depth.shape[1], depth.shape[0])
     up = None if frame.T_base_camera is None else frame.T_base_camera[2, :3]
-    T_camera_table = find_plane(depth, view, rng, objects=_spheres(depth, view, candidates), up=up)
+    T_camera_table = find_plane(depth, view, rng, objects=_spheres(depth, view, _surest(candidates)), up=up)
     if T_camera_table is None:
         raise Refused(_no_plane(frame, depth))
     height = height_above(depth, view, T_camera_table)
@@ -64,6 +64,12 @@ def _no_plane(frame: Frame, depth: Float32s) -> str:
         f"{frame.name}: no support plane{level}; the depth image has {int((frame.depth > 0).sum())} readings, {around} "
         "of them around the candidates, and a support plane needs 100 and a tenth of those near the objects"
     )
+
+
+def _surest(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Those at least half as confident as the most confident one: many unsure ones may lie on the floor."""
+    highest = max((candidate.confidence for candidate in candidates), default=0.0)
+    return [candidate for candidate in candidates if candidate.confidence >= highest / 2]
 
 
 def _spheres(depth: Float32s, view: View, candidates: Sequence[Candidate]) -> Floats:

@@ -16,8 +16,9 @@ def piece(color: tuple[int, int, int], height: int = 40, width: int = 20) -> tup
 
 
 def test_a_crop_is_the_masks_own_part_in_the_middle_of_grey() -> None:
-    crop, mask = piece((200, 30, 40))
+    crop, mask, whole = piece((200, 30, 40))
     assert crop.shape == (SIDE, SIDE, 3) and mask.shape == (SIDE, SIDE)
+    assert (whole == mask).all()
     rows, columns = np.nonzero(mask)
     assert np.ptp(rows) + 1 == pytest.approx(0.92 * SIDE, abs=1)
     assert (np.ptp(rows) + 1) / (np.ptp(columns) + 1) == pytest.approx(2, abs=0.05)
@@ -31,3 +32,14 @@ def test_equal_pieces_are_alike_and_colours_tell_pieces_apart() -> None:
     assert alike[0, 0] == pytest.approx(1, abs=1e-5)
     assert alike[0, 1] > 0.99 and alike[0, 2] < 0.1
     assert (looks.outline[0] == looks.outline[1]).mean() > 0.97
+
+
+def test_what_is_hidden_counts_for_the_frame_and_the_outline_alone() -> None:
+    rgb, whole = np.full((100, 120, 3), (200, 30, 40), np.uint8), np.zeros((100, 120), bool)
+    whole[30:70, 50:70] = True
+    seen = whole & (np.arange(100) < 50)[:, None]
+    part, alone = square(rgb, seen, whole), square(rgb, whole)
+    assert (part.whole == alone.whole).all() and part.mask.sum() == pytest.approx(part.whole.sum() / 2, rel=0.05)
+    assert (part.crop[part.mask] == (200, 30, 40)).all() and (part.crop[~part.mask] == 127).all()
+    looks = Looks.of([part, alone])
+    assert (looks.outline[0] == looks.outline[1]).all() and looks.covered[0].sum() < looks.covered[1].sum()

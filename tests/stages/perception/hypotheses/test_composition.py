@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import random_rotations
+from stages.messages.digest import GLIMPSE_STRIDE, ParticleTrace, Start
 from stages.perception.filter.likelihood import CostForm, Shape
 from stages.perception.hypotheses.combinations import cheapest
-from stages.perception.hypotheses.composition import STRIDE, Composition, FirstLook, charge, glimpse, rise, scene_cost
+from stages.perception.hypotheses.composition import Composition, FirstLook, charge, claim, glimpse, rise, scene_cost
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
 
@@ -86,7 +87,31 @@ def test_the_first_look_costs_what_the_composition_costs(seen: Rendered, shapes:
         for chosen in itertools.combinations(range(3), size):
             composition = Composition(seen.scene, FORM, [boxes[i] for i in chosen])
             change = composition.cost([layers[i] for i in chosen]) - composition.cost_of_nothing()
-            assert look.cost(chosen) == pytest.approx(change, rel=0.1, abs=0.2 * STRIDE**2)
+            assert look.cost(chosen) == pytest.approx(change, rel=0.1, abs=0.2 * GLIMPSE_STRIDE**2)
+
+
+def start(*, claim: float) -> Start:
+    trace = ParticleTrace(iterations=(), costs=np.zeros(0), positions=np.zeros((0, 4)))
+    return Start(T_camera_object=np.eye(4), trace=trace, rise=0.03, claim=claim)
+
+
+def test_an_object_is_charged_for_its_box_and_for_what_it_claims() -> None:
+    box = np.array([10.0, 10.0, 30.0, 20.0])
+    assert charge(box, start(claim=0.0), 0.9) == pytest.approx(0.1 * 200 * 0.03)
+    assert charge(box, start(claim=5.0), 0.9) == pytest.approx(4.5)
+
+
+def test_what_covers_its_own_readings_explains_them_and_what_hides_it_claims_nothing(
+    seen: Rendered, shapes: dict[str, Shape]
+) -> None:
+    claimed, explained = claim(seen.scene, layer(shapes, "tea_box", seen.poses["tea_box"]), FORM)
+    assert explained > 0.85 and claimed > 0.5 * FORM.truncation * seen.scene.foreground.sum() / len(PLACED)
+    wrong = seen.poses["tea_box"].copy()
+    wrong[:3, 3] += (0.03, 0.0, -0.02)
+    assert claim(seen.scene, layer(shapes, "tea_box", wrong), FORM)[1] < explained - 0.2
+    behind = seen.poses["mug"].copy()
+    behind[:3, 3] = 1.3 * seen.poses["tea_box"][:3, 3]
+    assert claim(seen.scene, layer(shapes, "mug", behind), FORM)[0] < 0.1 * claimed
 
 
 def test_an_object_cost_keeps_the_objects_and_drops_their_doubles(seen: Rendered, shapes: dict[str, Shape]) -> None:
@@ -98,7 +123,7 @@ def test_an_object_cost_keeps_the_objects_and_drops_their_doubles(seen: Rendered
     layers += [layer(shapes, "tea_box", beside), layer(shapes, "mug", behind)]
     boxes += [boxes[1], boxes[1]]
     glimpses = [glimpse(seen.scene, *each, FORM) for each in zip(layers, boxes, strict=True)]
-    look = FirstLook(glimpses, [charge([box], [0.03], 0.1) for box in boxes])
+    look = FirstLook(glimpses, [charge(box, start(claim=0.0), 0.1) for box in boxes])
     best = cheapest(look.cost, 5, None, 1)[0]
     assert best in {(0, 1, 2), (0, 2, 3)}
 
