@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from runner.contract import Refused
 from stages.devices import tabletop
+from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
@@ -354,13 +355,13 @@ def test_whole_footprints_stay_on_the_table_with_a_margin(
 
 def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     """The scenes of seed 104: the demonstrated place of the bottle is half beyond the table's front edge."""
-    name = tabletop.goal_name("auto", 104)
+    name = tray.goal_name("auto", 104)
     goal, start = (
         Layout({
             item: inverse(T_BASE_TABLE) @ T
             for item, T in sample(name, catalogue(), np.random.default_rng([104, kind])).items()
         })
-        for kind, sample in enumerate((tabletop.sample_goal, tabletop.sample_start))
+        for kind, sample in enumerate((tray.sample_goal, tray.sample_start))
     )  # fmt: skip
     table = tabletop.TABLE
     corner = np.array(table.center) - T_BASE_TABLE[:2, 3]

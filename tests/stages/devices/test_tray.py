@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
-from stages.devices import tabletop
 from stages.devices.simulation import Simulation
-from stages.devices.tabletop import GOALS, Layout, sample_goal, sample_start, support_height
+from stages.devices.suites import tray
+from stages.devices.suites.tray import GOALS, sample_goal, sample_start, support_height
+from stages.devices.tabletop import Layout
 from stages.scene.catalogue import Catalogue
 from tests.stages.planning.scenes import catalogue
 
@@ -16,7 +17,7 @@ Sampler = Callable[[str, Catalogue, np.random.Generator], Layout]
 @pytest.mark.parametrize("sample", [sample_goal, sample_start])
 @pytest.mark.parametrize("goal", GOALS)
 def test_layouts_stand_still(goal: str, sample: Sampler) -> None:
-    names = tabletop.object_names(goal)
+    names = tray.object_names(goal)
     simulation = Simulation(catalogue(), names)
     for seed in range(3):
         layout = sample(goal, catalogue(), np.random.default_rng(seed))
@@ -30,9 +31,9 @@ def test_layouts_stand_still(goal: str, sample: Sampler) -> None:
 @pytest.mark.parametrize("goal", GOALS)
 def test_goals_have_a_stack_a_filled_tray_and_neighbours(goal: str) -> None:
     spots = GOALS[goal]
-    inside = [spot for spot in spots if spot.support == tabletop.TRAY]
+    inside = [spot for spot in spots if spot.support == tray.TRAY]
     assert len(spots) == 5
-    assert any(spot.support not in (tabletop.TRAY, "table") for spot in spots)
+    assert any(spot.support not in (tray.TRAY, "table") for spot in spots)
     assert inside
     assert len(inside) >= 2 or any(spot.beside for spot in spots)
 
@@ -51,11 +52,11 @@ def test_start_and_goal_differ() -> None:
 
 def test_an_unknown_goal_is_refused_with_the_choices() -> None:
     with pytest.raises(Refused, match=r"dinner.*auto.*tea"):
-        tabletop.goal_name("dinner", 0)
+        tray.goal_name("dinner", 0)
 
 
 def test_support_heights() -> None:
-    tray, box = catalogue()["tray"], catalogue()["tea_box"]
-    assert support_height(tray, 0.0, 0.0) == pytest.approx(-0.009)
-    assert support_height(tray, 0.195, 0.0) == pytest.approx(0.015)
+    large, box = catalogue()["tray"], catalogue()["tea_box"]
+    assert support_height(large, 0.0, 0.0) == pytest.approx(-0.009)
+    assert support_height(large, 0.195, 0.0) == pytest.approx(0.015)
     assert support_height(box, 0.0, 0.0) == pytest.approx(0.040)
