@@ -371,3 +371,15 @@ def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     assert found.status == "solved", found.reason
     assert over_the_edge(found, surface) == []
     assert reached(goal, executed(start, found))
+
+
+def test_what_makes_room_is_not_put_where_the_room_is_needed():
+    """The tray stands so that only the other one of its two alike sides has the bowl's place within reach."""
+    turn = -1.87
+    goal = Layout().put("tray", 0.06, 0.2, yaw=turn).put("milk_carton", 0, 0, on="tray")
+    goal = goal.put("bowl", 0.058, -0.11).put("bowl_2", 0.04, -0.31)
+    start = Layout().put("tray", 0.084, -0.284, yaw=turn).put("bowl", 0, 0, on="tray")
+    start = start.put("milk_carton", 0.01, 0.03).put("bowl_2", 0.14, 0.02)
+    found = plan(goal, start)
+    assert found.status == "solved", found.reason
+    assert reached(goal, executed(start, found))
