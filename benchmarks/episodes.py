@@ -18,14 +18,17 @@ from typing import TypeVar
 
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
+from stages.devices.suites import kinds
 from stages.messages import Goal, Outcome, Snapshot, Verdict
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.truth import Judgement, Truth
 
 M = TypeVar("M", Goal, Outcome, Snapshot, Verdict)
 ROOT = Path(__file__).parents[1]
-SUITES: dict[str, tuple[str, ...]] = {"tray": ()}
-"""Settings of the world by suite: ``tray`` is what the graph lays out as it stands."""
+SUITES: dict[str, tuple[str, ...]] = {"tray": ()} | {
+    name: (f"world.suite={name}", "hypotheses.n_objects=auto") for name in kinds.DRAWN
+}
+"""Settings by suite: ``tray`` is what the graph lays out as it stands; of the others nobody knows how many objects."""
 
 
 @dataclass(frozen=True)

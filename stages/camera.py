@@ -48,7 +48,7 @@ class SimulatedCamera(Stage):
         return examine_egl()
 
     def on_snapshot(self, snapshot: Snapshot, ctx: Context) -> Frame:
-        """The image from where the encoders say the camera is."""
+        """The image, which is said to be from where the encoders have the camera."""
         T_base_camera = self._fetch.camera_pose(snapshot.joint_names, snapshot.joint_positions)
         rgb, depth = self._camera.image(snapshot, T_base_camera)
         if self._noise:

@@ -37,6 +37,8 @@ from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
+from stages.scene.relations import Tolerances, hanging
+from stages.scene.stance import Stances, standing_of
 from stages.scene.virtual import satisfied
 
 
@@ -137,6 +139,7 @@ class Demonstrator(Stage):
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
         self._memory = Memory(self._catalogue)
+        self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
         self._state = State(goal_name=config.goal_name) if config.scripted else State(phase=Phase.IDLE)
 
     def on_start(self, ctx: Context) -> Arrangement:
@@ -277,7 +280,11 @@ class Demonstrator(Stage):
         """What the scene lacks that it must show, in words; empty where it is complete."""
         if self._state.goal is None:
             wanted = 0 if self._config.n_objects == "auto" else self._config.n_objects
-            return f"{len(scene.objects)} of {wanted} objects seen" if len(scene.objects) < wanted else ""
+            if len(scene.objects) < wanted:
+                return f"{len(scene.objects)} of {wanted} objects seen"
+            standing = standing_of(scene.objects, self._stances, scene.T_base_table)
+            names = hanging(standing, scene.assertions, Tolerances())
+            return f"not seen: what carries {', '.join(names)}" if names else ""
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
-from stages.devices import fetch, tabletop
+from stages.devices import fetch
 from stages.devices.simulation import Simulation
+from stages.devices.suites import kinds
+from stages.devices.suites.placing import moved
+from stages.devices.suites.suite import Kind, Rejected
+from stages.devices.tabletop import Layout
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Arrange, Arrangement, LookRequest, Move, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -18,8 +23,8 @@ from stages.scene.catalogue import BUILT_IN, Catalogue
 _DRIFT = 0.01
 """Metres that an object may move while the scene settles before the arrangement counts as failed."""
 _TILT = 0.995
-"""Cosine of the largest tilt of an object that still stands."""
-_DRAWS = 20
+"""Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
+_DRAWS = 200
 
 
 class World(Stage):
@@ -29,22 +34,27 @@ class World(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """``seed`` draws the scenes; ``goal`` is a goal template by name or ``auto`` (chosen by the seed)."""
+        """``suite`` is the kind of scenes, ``seed`` draws them."""
 
         catalogue: Path = BUILT_IN
+        suite: str = "tray"
         seed: int = 0
         goal: str = "auto"
+        """Of the suite ``tray``: a goal template by name, or ``auto`` (chosen by the seed)."""
 
         def __post_init__(self) -> None:
             if self.seed < 0:
                 raise Refused(f"world.seed: {self.seed} is negative; choose 0, 1, 2, ...")
-            tabletop.goal_name(self.goal, self.seed)
+            kinds.check(self.suite, self.goal, self.seed)
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._goal = tabletop.goal_name(config.goal, config.seed)
-        self._simulation = Simulation(self._catalogue, tabletop.object_names(self._goal))
+        self._suite = kinds.suite(config.suite, self._catalogue, config.seed, goal=config.goal)
+        self._looks = 0
+        errors = self._suite.errors(np.random.default_rng(config.seed))
+        self._beyond = np.zeros(len(fetch.JOINT_NAMES)) if errors is None else errors.joints
+        self._simulation = Simulation(self._catalogue, self._suite.names, self._suite.table)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
@@ -59,57 +69,79 @@ class World(Stage):
 
     def on_move(self, move: Move, ctx: Context) -> None:
         """Puts one object elsewhere when somebody asks for it, whatever the robot is doing."""
-        layout = dict(zip(self._simulation.names, self._simulation.object_poses(), strict=True))
+        layout = dict(zip(self._simulation.present, self._simulation.object_poses(), strict=True))
         if move.name not in layout:
             raise Refused(f"name={move.name!r}: no such object; valid: {', '.join(layout)}")
-        self._simulation.place(move.name, tabletop.moved(move.name, move.x, move.y, layout, self._catalogue))
+        self._simulation.place(
+            move.name, moved(move.name, (move.x, move.y), layout, self._catalogue, self._suite.table)
+        )
         ctx.log(f"{move.name} moved to {move.x:.2f}, {move.y:.2f}")
 
     def on_look_request(self, look_request: LookRequest) -> Snapshot:
         """The world as it is now, for the simulated camera."""
+        table = self._suite.table
+        errors = self._suite.errors(np.random.default_rng([self._config.seed, 3, self._looks]))
+        self._looks += 1
         return Snapshot(
-            names=self._simulation.names,
+            names=self._simulation.present,
             T_base_objects=self._simulation.object_poses(),
             joint_names=fetch.JOINT_NAMES,
-            joint_positions=self._simulation.encoders(),
+            joint_positions=self._encoders(),
             time=self._simulation.time,
             purpose=look_request.purpose,
-            T_base_table=pose(np.eye(3), np.array([*tabletop.TABLE.center, tabletop.TABLE.height])),
+            T_base_table=pose(np.eye(3), np.array([*table.center, table.height])),
+            table_size=np.array(table.size),
+            errors=errors,
         )
 
     def on_robot_command(self, robot_command: RobotCommand) -> RobotState:
         """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders."""
         error = 0.0
         if len(robot_command.times):
+            beyond = [self._beyond[fetch.JOINT_NAMES.index(name)] for name in robot_command.joint_names]
             error = self._simulation.follow(
-                robot_command.joint_names, robot_command.times, robot_command.positions, robot_command.velocities
+                robot_command.joint_names,
+                robot_command.times,
+                robot_command.positions + beyond,
+                robot_command.velocities,
             )
         if robot_command.gripper_width is not None:
             self._simulation.move_gripper(robot_command.gripper_width)
         return self._state(error)
 
-    def _lay_out(self, kind: Literal["goal", "start"], draw: tuple[int, ...], ctx: Context) -> None:
+    def _lay_out(self, kind: Kind, draw: tuple[int, ...], ctx: Context) -> None:
+        """Draws scenes until one is possible and stands, and says how many were not, and why."""
         rng = np.random.default_rng([self._config.seed, int(kind == "start"), *draw])
-        sample = tabletop.sample_goal if kind == "goal" else tabletop.sample_start
-        for _ in range(_DRAWS):
-            layout = sample(self._goal, self._catalogue, rng)
+        rejected: Counter[str] = Counter()
+        for draws in range(1, _DRAWS + 1):
+            try:
+                layout = self._suite.sample(kind, rng)
+            except Rejected as reason:
+                rejected[str(reason)] += 1
+                continue
             self._simulation.arrange(layout)
             if self._stands(layout):
-                ctx.log(f"{kind} scene laid out: {', '.join(layout)}")
+                because = ", ".join(f"{why} {count}" for why, count in rejected.items())
+                left_out = f"; {rejected.total()} of {draws} draws rejected: {because}" if because else ""
+                ctx.log(f"{kind} scene laid out: {', '.join(layout)}{left_out}")
                 return
-        raise RuntimeError(f"no {kind} scene of {self._goal} stood in {_DRAWS} draws")
+            rejected["fell or slid"] += 1
+        raise RuntimeError(f"no {kind} scene of suite {self._config.suite} was possible in {_DRAWS} draws: {rejected}")
 
-    def _stands(self, layout: tabletop.Layout) -> bool:
-        poses = dict(zip(self._simulation.names, self._simulation.object_poses(), strict=True))
+    def _stands(self, layout: Layout) -> bool:
+        poses = dict(zip(self._simulation.present, self._simulation.object_poses(), strict=True))
         return all(
-            np.linalg.norm(poses[name][:3, 3] - T[:3, 3]) < _DRIFT and poses[name][2, 2] > _TILT
+            np.linalg.norm(poses[name][:3, 3] - T[:3, 3]) < _DRIFT and poses[name][:3, 2] @ T[:3, 2] > _TILT
             for name, T in layout.items()
         )
+
+    def _encoders(self) -> Floats:
+        return self._simulation.encoders() - self._beyond
 
     def _state(self, tracking_error: float = 0.0) -> RobotState:
         return RobotState(
             joint_names=fetch.JOINT_NAMES,
-            positions=self._simulation.encoders(),
+            positions=self._encoders(),
             gripper_width=self._simulation.gripper_width(),
             time=self._simulation.time,
             tracking_error=tracking_error,

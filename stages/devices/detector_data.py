@@ -11,7 +11,7 @@ import numpy as np
 from stages.devices import fetch
 from stages.devices.drops import distractors, random_layout, things
 from stages.devices.simulated_camera import K, SimulatedCamera
-from stages.devices.tabletop import GOALS, sample_goal, sample_start
+from stages.devices.suites.tray import GOALS, sample_goal, sample_start
 from stages.geometry.arrays import Floats
 from stages.messages import Snapshot
 from stages.perception.detection.trained.network import HEIGHT, WIDTH, fit

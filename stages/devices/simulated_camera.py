@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,8 +16,10 @@ from stages.geometry.camera import intrinsics
 from stages.messages import Snapshot
 from stages.messages.arrays import Depth, Mask, Rgb
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
+from stages.planning.collision import Table
 from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.catalogue.household_meshes import block
+from stages.scene.scoring import label_of
 
 WIDTH, HEIGHT = fetch.CAMERA_SIZE
 K = intrinsics(fetch.CAMERA_FOCAL, WIDTH, HEIGHT)
@@ -40,14 +43,24 @@ class SimulatedCamera:
     def __init__(self, catalogue: Catalogue) -> None:
         self._catalogue = catalogue
         self._renderer = Renderer(WIDTH, HEIGHT)
-        self._room = tuple(room())
 
     def image(self, snapshot: Snapshot, T_base_camera: Floats) -> tuple[Rgb, Depth]:
-        """The lit colour image (H x W x 3) and the perfect depth image (H x W, metres)."""
-        camera = Camera(K, T_base_camera)
-        items = [*self._room, *self._objects(snapshot), *robot(snapshot.joint_names, snapshot.joint_positions)]
-        rgb = self._renderer.color(items, camera, lighting=_ROOM_LIGHT, background=_SKY)
-        return rgb, self._renderer.depth(items, camera)
+        """The lit colour image (H x W x 3) and the depth image without noise (H x W, metres).
+
+        They are those of a camera at ``T_base_camera`` as far as the snapshot's sensors are right.
+        """
+        errors = snapshot.errors
+        if errors is None:
+            items = self._items(snapshot, snapshot.joint_positions)
+            camera = Camera(K, T_base_camera)
+            rgb = self._renderer.color(items, camera, lighting=_ROOM_LIGHT, background=_SKY)
+            return rgb, self._renderer.depth(items, camera)
+        positions = snapshot.joint_positions + errors.joints
+        items = self._items(snapshot, positions)
+        T_base_color = fetch.camera_pose(snapshot.joint_names, positions) @ errors.T_believed_true
+        rgb = self._renderer.color(items, Camera(K, T_base_color), lighting=_ROOM_LIGHT, background=_SKY)
+        depth = self._renderer.depth(items, Camera(K, T_base_color @ errors.T_color_depth))
+        return np.clip(np.round(rgb * errors.gains), 0, 255).astype(np.uint8), depth * np.float32(errors.depth)
 
     def robot_mask(self, snapshot: Snapshot, T_base_camera: Floats, depth: Depth) -> Mask:
         """Where the robot is in the image, H x W, from its encoders and the observed ``depth`` alone.
@@ -63,9 +76,10 @@ class SimulatedCamera:
         """Frees the OpenGL context."""
         self._renderer.close()
 
-    def _objects(self, snapshot: Snapshot) -> list[Item]:
+    def _items(self, snapshot: Snapshot, joint_positions: Floats) -> list[Item]:
         poses = zip(snapshot.names, snapshot.T_base_objects, strict=True)
-        return [Item(self._catalogue[name].mesh, T_base_object) for name, T_base_object in poses]
+        objects = (Item(self._catalogue[label_of(name, self._catalogue)].mesh, T) for name, T in poses)
+        return [*room(_table(snapshot)), *objects, *robot(snapshot.joint_names, joint_positions)]
 
 
 def robot_pixels(body: Depth, depth: Depth) -> Mask:
@@ -81,24 +95,34 @@ def robot(joint_names: Sequence[str], positions: Floats) -> list[Item]:
     return [Item(mesh, T_base_links[link]) for link, mesh in fetch.robot_meshes()]
 
 
-def room() -> list[Item]:
+def _table(snapshot: Snapshot) -> Table:
+    """The table of the snapshot; the usual one where it names none."""
+    if snapshot.T_base_table is None or snapshot.table_size is None:
+        return TABLE
+    x, y, height = snapshot.T_base_table[:3, 3].tolist()
+    depth, width = snapshot.table_size.tolist()
+    return Table(center=(x, y), size=(depth, width), height=height)
+
+
+@lru_cache(maxsize=1)
+def room(table: Table = TABLE) -> tuple[Item, ...]:
     """Table, floor and walls, in the robot's base frame."""
-    x, y = TABLE.center
-    depth, width = TABLE.size
-    top = _painted((depth, width, TABLE.thickness), 0.012, _planks)
-    leg = _painted((0.05, 0.05, TABLE.height - TABLE.thickness), 0.2, _plain((92, 84, 78)))
-    leg_height = (TABLE.height - TABLE.thickness) / 2
+    x, y = table.center
+    depth, width = table.size
+    top = _painted((depth, width, table.thickness), 0.012, _planks)
+    leg = _painted((0.05, 0.05, table.height - table.thickness), 0.2, _plain((92, 84, 78)))
+    leg_height = (table.height - table.thickness) / 2
     corners = [(sx * (depth / 2 - 0.05), sy * (width / 2 - 0.05)) for sx in (-1, 1) for sy in (-1, 1)]
     floor = _painted((6.0, 6.0, 0.02), 0.05, _tiles)
     wall = _painted((0.02, 6.0, 2.6), 0.1, _plain((206, 204, 196)))
     side = _painted((6.0, 0.02, 2.6), 0.1, _plain((196, 202, 206)))
-    return [
-        _at(top, x, y, TABLE.height - TABLE.thickness / 2),
+    return (
+        _at(top, x, y, table.height - table.thickness / 2),
         *(_at(leg, x + dx, y + dy, leg_height) for dx, dy in corners),
         _at(floor, 1.0, 0.0, -0.01),
         _at(wall, 2.6, 0.0, 1.3),
         *(_at(side, 1.0, sign * 2.4, 1.3) for sign in (-1, 1)),
-    ]
+    )
 
 
 Paint = Callable[[Floats], NDArray[np.uint8]]

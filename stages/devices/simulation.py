@@ -8,11 +8,13 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from stages.devices import fetch, tabletop
+from stages.devices import fetch
+from stages.devices.tabletop import TABLE
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.collision import add_primitives, add_table, quaternion
+from stages.planning.collision import Table, add_primitives, add_table, quaternion
 from stages.scene.catalogue import Catalogue, CatalogueObject
+from stages.scene.scoring import label_of
 
 _TIMESTEP = 0.002
 _SETTLE_AFTER_MOTION = 0.25
@@ -22,17 +24,19 @@ _GRIPPER_HOLD = 0.3
 """Seconds for the fingers to stall or arrive."""
 _DROP = 0.002
 """Metres above their support at which objects are laid out."""
+_AWAY = (-3.0, 0.5)
+"""Where on the floor behind the robot what no one has laid out is put, and how far apart; metres."""
 
 
 class Simulation:
-    """Physics of one robot and the objects ``names`` of the catalogue; all poses in the robot base frame.
+    """Physics of one robot and objects of the catalogue (``cup``, ``cup_2``, ...); all poses in the robot base frame.
 
     Objects are held by friction alone: elliptic friction cones, torsional friction at the finger pads and fingers
     coupled as on the real gripper keep what is held from creeping.
     """
 
-    def __init__(self, catalogue: Catalogue, names: tuple[str, ...]) -> None:
-        self.names = names
+    def __init__(self, catalogue: Catalogue, names: tuple[str, ...], table: Table = TABLE) -> None:
+        self._names = self.present = names
         spec = fetch.specification()
         option = spec.option
         option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -40,9 +44,9 @@ class Simulation:
         # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
         option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
-        add_table(spec, tabletop.TABLE)
+        add_table(spec, table)
         for name in names:
-            _add_object(spec, name, catalogue[name])
+            _add_object(spec, name, catalogue[label_of(name, catalogue)])
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._index()
@@ -53,13 +57,19 @@ class Simulation:
         return float(self._data.time)
 
     def arrange(self, layout: Mapping[str, Floats], *, settle: float = 1.5) -> None:
-        """Puts the robot at home and the objects at ``layout`` (T_base_object, 4 x 4), then lets physics settle."""
+        """Puts the robot at home and the objects at ``layout`` (T_base_object, 4 x 4), then lets physics settle.
+
+        Objects that the layout does not have are not ``present``: they are out of the way and out of sight.
+        """
         now = self._data.time
         mujoco.mj_resetData(self._model, self._data)
         self._data.time = now
         self._go_home()
         for name, T in layout.items():
             self._put(name, T)
+        self.present = tuple(name for name in self._names if name in layout)
+        for k, name in enumerate(name for name in self._names if name not in layout):
+            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, 0.1
         self.run(settle)
 
     def place(self, name: str, T_base_object: Floats, *, settle: float = 1.0) -> None:
@@ -110,8 +120,8 @@ class Simulation:
         return sum(fetch.GRIPPER.width(float(self._data.joint(name).qpos[0])) for name in fetch.FINGER_JOINTS) / 2
 
     def object_poses(self) -> Floats:
-        """N x 4 x 4: T_base_object of every object, in the order of ``names``."""
-        bodies = [self._data.body(name) for name in self.names]
+        """N x 4 x 4: T_base_object of every object that is ``present``, in that order."""
+        bodies = [self._data.body(name) for name in self.present]
         return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies])
 
     def _go_home(self) -> None:

@@ -1,330 +1,62 @@
-"""The table and the scenes that people lay out on it: goal templates and random start arrangements."""
+"""The table that the robot stands at, and what its head camera sees of what is laid out there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
-from itertools import combinations, permutations
 
 import numpy as np
 
-from runner.contract import Refused
 from stages.devices import fetch
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse, pose
+from stages.geometry.poses import inverse
 from stages.planning.collision import Table
-from stages.scene.catalogue import Catalogue, CatalogueObject, Primitive
+from stages.scene.catalogue import CatalogueObject
 
 TABLE = Table(center=(0.80, 0.0), size=(0.70, 1.20), height=0.70)
-TRAY = "tray"
 
 Layout = dict[str, Floats]
 """T_base_object (4 x 4) by name, supporters before what they support."""
 
-_NEAR, _FAR = 0.52, 0.80
-"""Metres in front of the robot between which objects stand."""
-_SHOULDER = np.array([0.033, 0.0])
-_REACH = 0.72
-"""Metres around the shoulder-pan axis within which objects are grasped and placed from the top."""
-_APART = 0.04
-"""Metres between objects that are not placed together: room for a finger."""
-_STACKED_SHARE = 0.3
-"""Share of start scenes that contain a stack, which is not the goal's."""
+HIDDEN = 0.5
+"""Largest share of an object's image rectangle that the rectangle of an object in front may cover."""
 _IMAGE = np.array(fetch.CAMERA_SIZE, float)
 """Pixels; what the head camera sees of a scene is judged with these."""
 _BORDER = 6.0
-_HIDDEN = 0.5
-"""Largest share of an object's image rectangle that the rectangle of an object in front may cover."""
-_ATTEMPTS = 2000
 
 
-@dataclass(frozen=True)
-class Spot:
-    """Where an object stands upright: on ``support``, at (x, y, yaw) in the frame of ``beside``; metres, degrees.
-
-    ``beside`` is the support unless named. On the table, without ``beside``, the place is drawn at random.
-    """
-
-    name: str
-    support: str
-    x: float = 0.0
-    y: float = 0.0
-    yaw: float = 0.0
-    beside: str = ""
-
-
-GOALS: dict[str, tuple[Spot, ...]] = {
-    "tea": (
-        Spot("tea_box", TRAY, x=-0.080, yaw=90),
-        Spot("soup_can", "tea_box"),
-        Spot("cup", TRAY, x=0.050),
-        Spot("sugar_box", "table"),
-        Spot("water_bottle", "table", y=0.105, beside="sugar_box"),
-    ),
-    "breakfast": (
-        Spot("sugar_box", TRAY, x=-0.100),
-        Spot("tea_box", TRAY, x=0.050, yaw=90),
-        Spot("tuna_can", "tea_box"),
-        Spot("milk_carton", "table"),
-        Spot("cup", "table", y=0.105, beside="milk_carton"),
-    ),
-    "lunch": (
-        Spot("tuna_can", TRAY, x=-0.090),
-        Spot("soup_can", "tuna_can"),
-        Spot("salt_shaker", TRAY, x=0.005),
-        Spot("cereal_box", TRAY, x=0.125),
-        Spot("water_bottle", "table"),
-    ),
-    "snack": (
-        Spot("cup", TRAY, x=-0.120),
-        Spot("milk_carton", TRAY, x=-0.015),
-        Spot("tea_box", "table"),
-        Spot("salt_shaker", "tea_box"),
-        Spot("tuna_can", TRAY, x=0.120),
-    ),
-}
-"""Goal scenes by name. Neighbours stand 3 cm apart, in line with neither's fingers."""
-
-
-def goal_name(goal: str, seed: int) -> str:
-    """The goal template that ``goal`` names; ``auto`` chooses by ``seed``.
-
-    Raises:
-        Refused: no such template.
-    """
-    if goal == "auto":
-        return tuple(GOALS)[seed % len(GOALS)]
-    if goal not in GOALS:
-        raise Refused(f"world.goal: no goal scene {goal!r}; choose auto or one of {', '.join(GOALS)}")
-    return goal
-
-
-def object_names(goal: str) -> tuple[str, ...]:
-    """The tray and the objects of a goal template."""
-    return (TRAY, *(spot.name for spot in GOALS[goal]))
-
-
-def sample_goal(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout:
-    """Draws the tray's place and the free places of a goal template until everything is reachable and seen."""
-    together = {frozenset((spot.name, spot.beside)) for spot in GOALS[goal] if spot.beside}
-    for _ in range(_ATTEMPTS):
-        layout = {TRAY: _tray_pose(catalogue, rng)}
-        for spot in GOALS[goal]:
-            layout[spot.name] = _spot_pose(spot, layout, catalogue, rng)
-        standing = [TRAY, *(spot.name for spot in GOALS[goal] if spot.support == "table")]
-        if _is_good(layout, standing, together, catalogue):
-            return layout
-    raise RuntimeError(f"no room for the goal scene {goal}")
-
-
-def sample_start(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout:
-    """Draws a start scene for the objects of a goal template: the tray elsewhere, the others apart on the table.
-
-    Some scenes contain a stack that the goal does not have.
-    """
-    stack = _wrong_stack(goal, catalogue, rng)
-    names = [name for name in object_names(goal) if stack is None or name != stack[0]]
-    for _ in range(_ATTEMPTS):
-        layout = _scatter(names, goal, catalogue, rng)
-        if layout is None:
-            continue
-        if stack is not None:
-            upper, lower = stack
-            layout[upper] = _spot_pose(Spot(upper, lower, yaw=rng.uniform(0, 360)), layout, catalogue, rng)
-        if _is_good(layout, names, set(), catalogue):
-            return layout
-    raise RuntimeError(f"no room for a start scene of {', '.join(names)}")
-
-
-def support_height(entry: CatalogueObject, x: float, y: float) -> float:
-    """Height in the object frame on which something rests above (x, y), metres: a tray's floor, a box's top."""
-    tops = [_top(primitive) for primitive in entry.collision if _covers(primitive, x, y)]
-    return max(tops, default=float(entry.bounds[1, 2]))
-
-
-def moved(name: str, x: float, y: float, layout: Layout, catalogue: Catalogue) -> Floats:
-    """T_base_object of an object that is put down upright at (x, y), on whatever is highest below it.
-
-    Raises Refused where there is no table below.
-    """
-    low, high = (np.array(TABLE.center) + sign * np.array(TABLE.size) / 2 for sign in (-1, 1))
-    if not ((low < [x, y]) & ([x, y] < high)).all():
-        raise Refused(
-            f"x={x:g} y={y:g}: beside the table; valid: {low[0]:g} to {high[0]:g} and {low[1]:g} to {high[1]:g}"
-        )
-    entry, others = catalogue[name], {other: T for other, T in layout.items() if other != name}
-    corners = (np.array([*np.ndindex(3, 3)]) - 1) * entry.dimensions[:2] / 2
-    height = max(_height_over(x + dx, y + dy, others, catalogue) for dx, dy in corners.tolist())
-    yaw = np.arctan2(layout[name][1, 0], layout[name][0, 0])
-    return _standing(entry, x, y, yaw, height)
-
-
-def _height_over(x: float, y: float, layout: Layout, catalogue: Catalogue) -> float:
-    """Height of the highest surface at (x, y) in the base frame, metres."""
-    tops = [TABLE.height]
-    for name, T in layout.items():
-        local = inverse(T) @ [x, y, 0, 1]
-        tops += [T[2, 3] + _top(one) for one in catalogue[name].collision if _covers(one, local[0], local[1])]
-    return float(max(tops))
-
-
-def _scatter(names: list[str], goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout | None:
-    """Places one object after the other where it keeps its distance; None where the table is too full."""
-    layout: Layout = {}
-    for name in names:
-        for _ in range(60):
-            T = _tray_pose(catalogue, rng) if name == TRAY else _free_pose(catalogue[name], rng)
-            layout[name] = T
-            if _fits(name, layout, goal, catalogue):
-                break
-        else:
-            return None
-    return layout
-
-
-def _fits(name: str, layout: Layout, goal: str, catalogue: Catalogue) -> bool:
-    """The object is in reach (of the tray: what the goal puts into it), in view and apart from all others."""
-    T, entry = layout[name], catalogue[name]
-    if not (
-        _can_be_filled(T, goal) if name == TRAY else _reachable(T) and _is_inside_image(_image_rectangle(entry, T))
-    ):
-        return False
-    return all(_gap(name, other, layout, catalogue) >= _APART for other in layout if other != name)
-
-
-def _can_be_filled(T_base_tray: Floats, goal: str) -> bool:
-    """Every place in the tray that the goal uses is in reach."""
-    spots = [spot for spot in GOALS[goal] if spot.support == TRAY]
-    return all(_reachable(T_base_tray @ pose(np.eye(3), np.array([spot.x, spot.y, 0.0]))) for spot in spots)
-
-
-def _wrong_stack(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> tuple[str, str] | None:
-    """An (upper, lower) pair that stands safely and is not in the goal, or None."""
-    wanted = {(spot.name, spot.support) for spot in GOALS[goal]}
-    names = [spot.name for spot in GOALS[goal]]
-    pairs = [pair for pair in permutations(names, 2) if pair not in wanted and _stands_on(*pair, catalogue)]
-    if not pairs or rng.random() > _STACKED_SHARE:
-        return None
-    return pairs[rng.integers(len(pairs))]
-
-
-def _stands_on(upper: str, lower: str, catalogue: Catalogue) -> bool:
-    above, below = catalogue[upper], catalogue[lower]
-    flat = len(below.collision) == 1 and not below.concave
-    low = above.dimensions[2] + below.dimensions[2] < 0.2
-    return bool(flat and low and above.dimensions[:2].max() <= 1.1 * below.dimensions[:2].min())
-
-
-def _tray_pose(catalogue: Catalogue, rng: np.random.Generator) -> Floats:
-    """The tray to the left or right of the middle, its long side roughly along the table's edge."""
-    y = rng.choice([-1, 1]) * rng.uniform(0.14, 0.25)
-    return _standing(catalogue[TRAY], rng.uniform(0.63, 0.68), y, np.deg2rad(90 + rng.uniform(-12, 12)), TABLE.height)
-
-
-def _free_pose(entry: CatalogueObject, rng: np.random.Generator) -> Floats:
-    x, y = rng.uniform(_NEAR, _FAR), rng.uniform(-0.45, 0.45)
-    return _standing(entry, x, y, rng.uniform(-np.pi, np.pi), TABLE.height)
-
-
-def _spot_pose(spot: Spot, layout: Layout, catalogue: Catalogue, rng: np.random.Generator) -> Floats:
-    entry = catalogue[spot.name]
-    reference = spot.beside or spot.support
-    if reference == "table":
-        return _free_pose(entry, rng)
-    T = layout[reference]
-    x, y = (T @ [spot.x, spot.y, 0, 1])[:2]
-    yaw = np.arctan2(T[1, 0], T[0, 0]) + np.deg2rad(spot.yaw)
-    return _standing(entry, x, y, yaw, _height_at(spot.support, x, y, layout, catalogue))
-
-
-def _height_at(support: str, x: float, y: float, layout: Layout, catalogue: Catalogue) -> float:
-    """Height of the upper surface of ``support`` at (x, y) in the base frame, metres."""
-    if support == "table":
-        return TABLE.height
-    T = layout[support]
-    local = inverse(T) @ [x, y, 0, 1]
-    return float(T[2, 3] + support_height(catalogue[support], local[0], local[1]))
-
-
-def _standing(entry: CatalogueObject, x: float, y: float, yaw: float, height: float) -> Floats:
-    """T_base_object of an upright object whose lowest point is at ``height``."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([x, y, height - entry.bounds[0, 2]]))
-
-
-def _is_good(layout: Layout, standing: Iterable[str], together: set[frozenset[str]], catalogue: Catalogue) -> bool:
-    """Everything but the tray in reach, all of it in view, and what stands on the table apart."""
-    reach = all(_reachable(T) for name, T in layout.items() if name != TRAY)
-    apart = all(
-        frozenset(pair) in together or _gap(*pair, layout, catalogue) >= _APART for pair in combinations(standing, 2)
-    )
-    return reach and apart and _is_seen(layout, catalogue)
-
-
-def _reachable(T: Floats) -> bool:
-    return bool(np.linalg.norm(T[:2, 3] - _SHOULDER) <= _REACH and _NEAR <= T[0, 3] <= _FAR)
-
-
-def _gap(a: str, b: str, layout: Layout, catalogue: Catalogue) -> float:
-    """Metres between the upright enclosing boxes of two objects; 0 or less where they overlap."""
-    outlines = {name: (layout[name], catalogue[name]) for name in (a, b)}
-    return min(_distance(*outlines[a], *outlines[b]), _distance(*outlines[b], *outlines[a]))
-
-
-def _distance(T_base_a: Floats, a: CatalogueObject, T_base_b: Floats, b: CatalogueObject) -> float:
-    """Smallest signed distance of the outline of ``a`` from the rectangle of ``b``."""
-    sides = np.linspace(-1, 1, 9)
-    unit = np.concatenate([np.stack([sides, np.full(9, s)], 1) for s in (-1, 1)])
-    outline = np.concatenate([unit, unit[:, ::-1]]) * a.dimensions[:2] / 2 + a.bounds.mean(0)[:2]
-    T = inverse(T_base_b) @ T_base_a
-    points = outline @ T[:2, :2].T + T[:2, 3]
-    outside = np.abs(points - b.bounds.mean(0)[:2]) - b.dimensions[:2] / 2
-    return float((np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(1), 0)).min())
-
-
-def _is_seen(layout: Layout, catalogue: Catalogue) -> bool:
-    """Every object wholly in the head camera's image and none mostly behind another."""
-    objects = {name: T for name, T in layout.items() if name != TRAY}
-    rectangles = [_image_rectangle(catalogue[name], T) for name, T in objects.items()]
-    if not all(_is_inside_image(rectangle) for rectangle in rectangles):
+def is_seen(objects: Sequence[tuple[CatalogueObject, Floats]], hidden: float = HIDDEN) -> bool:
+    """Every object (at its T_base_object) wholly in the head camera's image and no more ``hidden`` by another one."""
+    rectangles = [image_rectangle(*each) for each in objects]
+    if not all(is_inside_image(rectangle) for rectangle in rectangles):
         return False
     low, high = np.array([r[0] for r in rectangles]), np.array([r[1] for r in rectangles])
     overlap = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0).prod(-1)
-    hidden = overlap / (high - low).prod(-1)[:, None]
+    covered = overlap / (high - low).prod(-1)[:, None]
     # An object in front reaches lower in the image; what is stacked is not in front of what carries it.
-    places = np.array([T[:2, 3] for T in objects.values()])
+    places = np.array([T[:2, 3] for _, T in objects])
     stacked = np.linalg.norm(places[:, None] - places, axis=2) < 0.03
     behind = (high[:, None, 1] < high[None, :, 1]) & ~stacked
-    return bool((hidden[behind] <= _HIDDEN).all())
+    return bool((covered[behind] <= hidden).all())
 
 
-def _is_inside_image(rectangle: Floats) -> bool:
+def is_inside_image(rectangle: Floats) -> bool:
+    """Whether a rectangle of pixels (2 x 2) lies in the head camera's image, away from its border."""
     return bool((rectangle[0] >= _BORDER).all() and (rectangle[1] <= _IMAGE - _BORDER).all())
 
 
-def _image_rectangle(entry: CatalogueObject, T_base_object: Floats) -> Floats:
+def image_rectangle(entry: CatalogueObject, T_base_object: Floats) -> Floats:
     """2 x 2: lowest and highest pixel coordinates of the enclosing box."""
     corners = np.array(
         [[entry.bounds[i, 0], entry.bounds[j, 1], entry.bounds[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]
     )
-    T = _T_camera_base() @ T_base_object
+    T = T_camera_base() @ T_base_object
     points = corners @ T[:3, :3].T + T[:3, 3]
     pixels = points[:, :2] / points[:, 2:] * fetch.CAMERA_FOCAL + _IMAGE / 2
     return np.stack([pixels.min(0), pixels.max(0)])
 
 
 @lru_cache(maxsize=1)
-def _T_camera_base() -> Floats:
+def T_camera_base() -> Floats:
+    """Of the head camera while the robot is at home, 4 x 4."""
     return inverse(fetch.camera_pose(tuple(fetch.HOME), np.array(list(fetch.HOME.values()))))
-
-
-def _covers(primitive: Primitive, x: float, y: float) -> bool:
-    local = inverse(primitive.T_object_primitive) @ [x, y, 0, 1]
-    if primitive.kind == "cylinder":
-        return bool(np.hypot(local[0], local[1]) <= primitive.size[0])
-    return bool((np.abs(local[:2]) <= np.array(primitive.size[:2]) / 2).all())
-
-
-def _top(primitive: Primitive) -> float:
-    return float(primitive.T_object_primitive[2, 3] + primitive.size[-1] / 2)

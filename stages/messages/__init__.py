@@ -11,7 +11,7 @@ from stages.messages.digest import Candidate, Candidates, Hypothesis, Observatio
 from stages.messages.robot import RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
-from stages.messages.sensing import Frame, LookRequest, Snapshot
+from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
 from stages.messages.task import (
     Arrange,
     Arrangement,
@@ -64,6 +64,7 @@ __all__ = [
     "Ros2Sent",
     "SceneEstimate",
     "SceneGraph",
+    "SensorErrors",
     "Snapshot",
     "Stop",
     "Task",

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from runner.contract import Message
+from runner.contract import Message, Struct
 from stages.messages.arrays import Depth, Intrinsics, Mask, Pose, Poses, Rgb, Vector
 
 
@@ -12,6 +12,21 @@ class LookRequest(Message, frozen=True, kw_only=True):
     starts_lineage: ClassVar[bool] = True
     purpose: str
     """Shown to people, for example ``goal``, ``start`` or ``after transfer 2``."""
+
+
+class SensorErrors(Struct, frozen=True, kw_only=True):
+    """What is wrong with the simulated camera and the encoders, and what the robot does not know."""
+
+    depth: float
+    """Factor on all depths."""
+    T_believed_true: Pose
+    """Where the camera is, in the frame in which it is said to be."""
+    T_color_depth: Pose
+    """Where the depth camera is, in the colour camera's frame, though depth is said to be registered to colour."""
+    joints: Vector
+    """How far each joint is beyond what its encoder says, in the order of ``joint_names``."""
+    gains: Vector
+    """Factors on red, green and blue: exposure and white balance."""
 
 
 class Snapshot(Message, frozen=True, kw_only=True):
@@ -24,11 +39,15 @@ class Snapshot(Message, frozen=True, kw_only=True):
     T_base_objects: Poses
     joint_names: tuple[str, ...]
     joint_positions: Vector
+    """What the encoders say."""
     time: float
     """Simulated seconds."""
     purpose: str = ""
     T_base_table: Pose | None = None
     """The table's surface: z up, the origin in its middle; None in recordings that are older."""
+    table_size: Vector | None = None
+    """Its extent along x and y, metres; None in recordings that are older."""
+    errors: SensorErrors | None = None
 
 
 class Frame(Message, frozen=True, kw_only=True):

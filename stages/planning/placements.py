@@ -109,12 +109,12 @@ class Placements:
                 made += [Placement(_shifted(base, shift), away + cost + float(np.hypot(*shift))) for shift in near]
         return sorted(made, key=lambda placement: placement.cost)
 
-    def reserved(self, pending: Sequence[Step], scene: Scene) -> list[Standing]:
-        """Where the objects of steps still to come will stand on the table, as demonstrated."""
+    def reserved(self, pending: Sequence[Step], scene: Scene) -> list[list[Standing]]:
+        """Where the object of each step still to come may stand on the table, as demonstrated first."""
         steps = [step for step in pending if step.destination == TABLE and step.item in self._poses]
-        nominal = ((step, self._nominal(step, scene)) for step in steps)
         return [
-            Standing.at(step.item, self._stances[self._labels[step.item]], poses[0]) for step, poses in nominal if poses
+            [Standing.at(step.item, self._stances[self._labels[step.item]], T) for T in self._nominal(step, scene)]
+            for step in steps
         ]
 
     def _nominal(self, step: Step, scene: Scene) -> list[Floats]:

@@ -193,7 +193,10 @@ class Targets:
         """Places on the table, near and with space around them, where nothing of the goal will stand."""
         item = scene.standing[step.item]
         others = scene.others(step.item, TABLE)
-        reserved = self._placements.reserved(pending, scene)
+        reserved = [
+            next((place for place in places if self._supported(place, TABLE, scene, None)), places[0])
+            for places in self._placements.reserved(pending, scene)
+        ]
         spots: list[Placement] = []
         for spot in self._grid(item, scene):
             if not self._on_table(spot, scene):

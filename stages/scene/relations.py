@@ -69,6 +69,12 @@ def supports(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, 
     return {item.name: found[item.name] for item in standing}
 
 
+def hanging(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: Tolerances) -> tuple[str, ...]:
+    """Objects that are said to be on the table and are above it: what carries them was not seen."""
+    on_table = {item.arguments[0] for item in found if item.predicate == "on" and item.arguments[1] == TABLE}
+    return tuple(item.name for item in standing if item.name in on_table and item.z_bottom > tolerances.contact)
+
+
 def _supporters(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, dict[str, float]]:
     """For each object all that could carry it, directly or through others, and by how much they overlap."""
     found: dict[str, dict[str, float]] = {}

@@ -34,6 +34,17 @@ def errors(
 
     No perceived object answers for two true ones.
     """
+    found = matched(names, T_base_objects, perceived, catalogue)
+    return tuple(
+        _error(name, T_base_objects[k], found[k], catalogue) if k in found else ObjectError(name, found=False)
+        for k, name in enumerate(names)
+    )
+
+
+def matched(
+    names: Sequence[str], T_base_objects: Floats, perceived: Sequence[SceneObject], catalogue: Catalogue
+) -> dict[int, SceneObject]:
+    """The perceived object of every true one, by the true one's number; the nearest of its label, each once."""
     labels = [label_of(name, catalogue) for name in names]
     matched: dict[int, SceneObject] = {}
     for label in dict.fromkeys(labels):
@@ -42,10 +53,7 @@ def errors(
         distances = [[np.linalg.norm(_offset(T_base_objects[k], item.T_base_object)) for item in seen] for k in truth]
         rows, columns = linear_sum_assignment(np.reshape(distances, (len(truth), len(seen))))
         matched |= {truth[row]: seen[column] for row, column in zip(rows, columns, strict=True)}
-    return tuple(
-        _error(name, T_base_objects[k], matched[k], catalogue) if k in matched else ObjectError(name, found=False)
-        for k, name in enumerate(names)
-    )
+    return matched
 
 
 def label_of(name: str, catalogue: Catalogue) -> str:

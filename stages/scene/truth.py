@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 from typing import Literal
 
 import msgspec
@@ -15,13 +16,16 @@ from stages.geometry.poses import inverse
 from stages.messages import Assertion, Goal, Outcome, SceneGraph, Snapshot, Verdict, VirtualObject
 from stages.messages.scene import SceneObject
 from stages.scene.catalogue import Catalogue
+from stages.scene.naming import unique_names
 from stages.scene.relations import Tolerances, assertions, supports
-from stages.scene.scoring import label_of
+from stages.scene.scoring import label_of, matched
 from stages.scene.stance import Stances, standing_of
 from stages.scene.virtual import satisfied
 
 _BELOW = 0.02
 """Metres below the table's surface from which on an object has left the table."""
+_STAYED = 0.03
+"""Metres within which an object of no goal stays where it stood."""
 _TIPPED = np.cos(np.deg2rad(30.0))
 """Cosine of the angle by which an object's upward direction has turned if it was knocked over."""
 
@@ -31,9 +35,9 @@ class Loss:
     """An object that ended where nobody wanted it."""
 
     name: str
-    how: Literal["left the table", "was knocked over"]
+    how: Literal["left the table", "was knocked over", "is in no goal and was moved"]
     said: bool
-    """Whether the verdict's reason or a failed transfer names it."""
+    """Whether the verdict's reason or a failed transfer names it; of what was moved, any transfer."""
 
     def __str__(self) -> str:
         return f"{self.name} {self.how}, {'as was said' if self.said else 'and nobody said so'}"
@@ -68,6 +72,7 @@ class Truth:
 
     The goal is what was shown: on, in, clear and exist are those of the true poses at the look that taught it. What
     stands beside what is a matter of a threshold, so the pairs are those that were taught, each where it truly stood.
+    Equal objects are exchangeable: they are named as they were taught, and at the end as suits the goal best.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
@@ -81,13 +86,35 @@ class Truth:
         if goal is None:
             return Judgement(verdict.success)
         shown = max(k for k, one in enumerate(snapshots) if _shows(one.purpose, goal.name))
-        final = snapshots[-1]
-        wanted = self._wanted(snapshots[shown], goal.scene)
-        held, violated = satisfied(wanted, self._scene(final, goal.scene), self._catalogue)
+        wanted = self._wanted(self._as_taught(snapshots[shown], goal.scene), goal.scene)
+        ends = (self._scene(final, goal.scene) for final in self._exchanged(snapshots[-1]))
+        found = [satisfied(wanted, end, self._catalogue) for end in ends]
+        held, violated = min(found, key=lambda relations: len(relations[1]))
         return Judgement(
             verdict.success, held, violated, _differences(held, violated, verdict),
-            self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes)),
+            self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes), {one.object for one in outcomes}),
         )  # fmt: skip
+
+    def _as_taught(self, shown: Snapshot, taught: SceneGraph) -> Snapshot:
+        """Equal objects with the names of those that were perceived where they are."""
+        labels = [label_of(name, self._catalogue) for name in shown.names]
+        matches = matched(shown.names, shown.T_base_objects, taught.objects, self._catalogue)
+        kept = [matches[k].name if k in matches else None for k in range(len(labels))]
+        return msgspec.structs.replace(shown, names=tuple(unique_names(labels, kept)))
+
+    def _exchanged(self, final: Snapshot) -> Iterator[Snapshot]:
+        """The scene with every way to name its equal objects, as it is first."""
+        labels = [label_of(name, self._catalogue) for name in final.names]
+        groups = [
+            [name for name, other in zip(final.names, labels, strict=True) if other == label] for label in set(labels)
+        ]
+        for orders in product(*map(permutations, groups)):
+            new = {
+                old: name
+                for group, order in zip(groups, orders, strict=True)
+                for old, name in zip(group, order, strict=True)
+            }
+            yield msgspec.structs.replace(final, names=tuple(new[name] for name in final.names))
 
     def _scene(self, snapshot: Snapshot, taught: SceneGraph) -> SceneGraph:
         """The true scene graph; what left the table does not exist in it."""
@@ -111,23 +138,32 @@ class Truth:
         beside = tuple(item for item in taught.assertions if not names.isdisjoint(item.arguments))
         return msgspec.structs.replace(scene, virtual_objects=regions, assertions=(*scene.assertions, *beside))
 
-    def _losses(self, snapshots: Sequence[Snapshot], taught: SceneGraph, words: set[str]) -> tuple[Loss, ...]:
-        """What left the table, or stands neither as it was shown nor as it stood when the work began."""
-        shown, final = snapshots[0], snapshots[-1]
-        before = (shown, snapshots[min(1, len(snapshots) - 1)])
-        T_base_table = _table(final, taught)
+    def _losses(
+        self, snapshots: Sequence[Snapshot], taught: SceneGraph, words: set[str], carried: set[str]
+    ) -> tuple[Loss, ...]:
+        """What left the table, stands neither as it was shown nor as at the start, or had to stay and did not."""
+        shown, start, final = map(_poses, (snapshots[0], snapshots[min(1, len(snapshots) - 1)], snapshots[-1]))
+        T_base_table = _table(snapshots[-1], taught)
         found: list[Loss] = []
-        for k, (name, T) in enumerate(zip(final.names, final.T_base_objects, strict=True)):
+        for name, T in final.items():
+            before = [poses[name] for poses in (shown, start) if name in poses]
             if _left(T, T_base_table):
                 found.append(Loss(name, "left the table", name in words))
-            elif not any(self._alike(name, T, one.T_base_objects[k]) for one in before):
+            elif not any(self._alike(name, T, other) for other in before):
                 found.append(Loss(name, "was knocked over", name in words))
+            elif name not in shown and np.linalg.norm(T[:2, 3] - start[name][:2, 3]) > _STAYED:
+                found.append(Loss(name, "is in no goal and was moved", name in words | carried))
         return tuple(found)
 
     def _alike(self, name: str, A: Floats, B: Floats) -> bool:
         """Whether the same side of an object is up, modulo its symmetries."""
         turned = B[2, :3] @ self._catalogue[label_of(name, self._catalogue)].symmetries.transforms()[:, :3, :3]
         return bool((turned @ A[2, :3]).max() > _TIPPED)
+
+
+def _poses(snapshot: Snapshot) -> dict[str, Floats]:
+    """T_base_object by name."""
+    return dict(zip(snapshot.names, snapshot.T_base_objects, strict=True))
 
 
 def _shows(purpose: str, name: str) -> bool:

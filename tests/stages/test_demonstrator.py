@@ -295,6 +295,19 @@ def test_a_goal_with_too_few_objects_is_not_remembered() -> None:
     assert not verdict.satisfied and not verdict.violated
 
 
+def test_a_goal_in_which_something_hangs_in_the_air_is_not_remembered() -> None:
+    episode = Episode(repeats=1)
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    tower = Layout().put("tuna_can", 0.1, 0.0).put("soup_can", 0.0, 0.0, on="tuna_can")
+    gap = Layout({name: T for name, T in tower.poses.items() if name != "tuna_can"}).graph()
+    assert episode.seen(gap) == [LookRequest(purpose="goal, look 2")]
+    verdict = the_verdict(episode.seen(gap))
+    assert (verdict.failed_stage, verdict.reason) == (
+        "perception", "not seen: what carries soup_can (2 looks at scene 'goal')",
+    )  # fmt: skip
+
+
 def test_an_episode_that_never_succeeds_ends() -> None:
     episode = Episode(max_transfers=5)
     episode.until_task()

@@ -8,6 +8,7 @@ import pytest
 
 from runner.contract import Level, Refused
 from stages.devices import fetch, tabletop
+from stages.devices.suites import tray
 from stages.executor import Executor
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
@@ -86,7 +87,7 @@ def misperceived(T: Floats, rng: np.random.Generator) -> Floats:
 @pytest.mark.slow
 def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
     bench, rng = Bench(0, "tea"), np.random.default_rng(1)
-    goal = tabletop.sample_goal("tea", bench.world._catalogue, rng)  # pyright: ignore[reportPrivateUsage]
+    goal = tray.sample_goal("tea", bench.world._catalogue, rng)  # pyright: ignore[reportPrivateUsage]
     for name, destination in (("tea_box", "tray"), ("soup_can", "tea_box")):
         before = bench.poses()
         perceived = {key: misperceived(T, rng) for key, T in before.items()}

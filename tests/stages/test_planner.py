@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from runner.contract import Refused
 from stages.devices import tabletop
+from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
@@ -354,13 +355,13 @@ def test_whole_footprints_stay_on_the_table_with_a_margin(
 
 def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     """The scenes of seed 104: the demonstrated place of the bottle is half beyond the table's front edge."""
-    name = tabletop.goal_name("auto", 104)
+    name = tray.goal_name("auto", 104)
     goal, start = (
         Layout({
             item: inverse(T_BASE_TABLE) @ T
             for item, T in sample(name, catalogue(), np.random.default_rng([104, kind])).items()
         })
-        for kind, sample in enumerate((tabletop.sample_goal, tabletop.sample_start))
+        for kind, sample in enumerate((tray.sample_goal, tray.sample_start))
     )  # fmt: skip
     table = tabletop.TABLE
     corner = np.array(table.center) - T_BASE_TABLE[:2, 3]
@@ -369,4 +370,16 @@ def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     found = plan(goal, start, surface=surface)
     assert found.status == "solved", found.reason
     assert over_the_edge(found, surface) == []
+    assert reached(goal, executed(start, found))
+
+
+def test_what_makes_room_is_not_put_where_the_room_is_needed():
+    """The tray stands so that only the other one of its two alike sides has the bowl's place within reach."""
+    turn = -1.87
+    goal = Layout().put("tray", 0.06, 0.2, yaw=turn).put("milk_carton", 0, 0, on="tray")
+    goal = goal.put("bowl", 0.058, -0.11).put("bowl_2", 0.04, -0.31)
+    start = Layout().put("tray", 0.084, -0.284, yaw=turn).put("bowl", 0, 0, on="tray")
+    start = start.put("milk_carton", 0.01, 0.03).put("bowl_2", 0.14, 0.02)
+    found = plan(goal, start)
+    assert found.status == "solved", found.reason
     assert reached(goal, executed(start, found))

@@ -116,3 +116,26 @@ def test_what_lies_as_it_was_shown_was_not_knocked_over() -> None:
 def test_without_a_goal_nothing_was_restored() -> None:
     found = TRUTH.judge([snapshot(START, "goal")], None, verdict(SHOWN, START), ())
     assert not found.restored and not found.false_success
+
+
+def test_equal_objects_are_exchangeable_and_taught_under_any_names() -> None:
+    shown = Layout().put("tray", 0.1, 0.2).put("cup", 0.0, 0.0, on="tray").put("cup_2", 0.0, -0.3)
+    exchanged = Layout().put("tray", 0.1, 0.2).put("cup_2", 0.0, 0.0, on="tray").put("cup", 0.0, -0.3)
+    assert judged(exchanged, verdict(shown, shown), taught=shown, shown=shown).restored
+    found = judged(shown, verdict(exchanged, exchanged), taught=exchanged, shown=shown)
+    assert found.restored and found.differences == ()
+
+
+def test_what_is_in_no_goal_must_stay() -> None:
+    stranger = START.poses | {"mug": Layout().put("mug", -0.1, 0.3).poses["mug"]}
+    pushed = SHOWN.poses | {"mug": Layout().put("mug", -0.1, 0.36).poses["mug"]}
+
+    def losses(final: dict[str, np.ndarray], *outcomes: Outcome) -> list[str]:
+        looks = [snapshot(SHOWN, "goal"), snapshot(Layout(stranger), "start"), snapshot(Layout(final), "after")]
+        goal = Goal(name="tea", scene=SHOWN.graph(), pddl="")
+        return [str(loss) for loss in TRUTH.judge(looks, goal, verdict(SHOWN, SHOWN), outcomes).losses]
+
+    assert losses(SHOWN.poses | {"mug": stranger["mug"]}) == []
+    assert losses(pushed) == ["mug is in no goal and was moved, and nobody said so"]
+    carried = outcome(1, transfer("mug", "table", "table"))
+    assert losses(pushed, carried) == ["mug is in no goal and was moved, as was said"]

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
-from stages.devices import tabletop
 from stages.devices.simulation import Simulation
-from stages.devices.tabletop import GOALS, Layout, sample_goal, sample_start, support_height
+from stages.devices.suites import tray
+from stages.devices.suites.placing import moved, support_height
+from stages.devices.suites.tray import GOALS, sample_goal, sample_start
+from stages.devices.tabletop import TABLE, Layout
 from stages.scene.catalogue import Catalogue
 from tests.stages.planning.scenes import catalogue, standing
 
@@ -16,7 +18,7 @@ Sampler = Callable[[str, Catalogue, np.random.Generator], Layout]
 @pytest.mark.parametrize("sample", [sample_goal, sample_start])
 @pytest.mark.parametrize("goal", GOALS)
 def test_layouts_stand_still(goal: str, sample: Sampler) -> None:
-    names = tabletop.object_names(goal)
+    names = tray.object_names(goal)
     simulation = Simulation(catalogue(), names)
     for seed in range(3):
         layout = sample(goal, catalogue(), np.random.default_rng(seed))
@@ -30,9 +32,9 @@ def test_layouts_stand_still(goal: str, sample: Sampler) -> None:
 @pytest.mark.parametrize("goal", GOALS)
 def test_goals_have_a_stack_a_filled_tray_and_neighbours(goal: str) -> None:
     spots = GOALS[goal]
-    inside = [spot for spot in spots if spot.support == tabletop.TRAY]
+    inside = [spot for spot in spots if spot.support == tray.TRAY]
     assert len(spots) == 5
-    assert any(spot.support not in (tabletop.TRAY, "table") for spot in spots)
+    assert any(spot.support not in (tray.TRAY, "table") for spot in spots)
     assert inside
     assert len(inside) >= 2 or any(spot.beside for spot in spots)
 
@@ -51,13 +53,13 @@ def test_start_and_goal_differ() -> None:
 
 def test_an_unknown_goal_is_refused_with_the_choices() -> None:
     with pytest.raises(Refused, match=r"dinner.*auto.*tea"):
-        tabletop.goal_name("dinner", 0)
+        tray.goal_name("dinner", 0)
 
 
 def test_support_heights() -> None:
-    tray, box = catalogue()["tray"], catalogue()["tea_box"]
-    assert support_height(tray, 0.0, 0.0) == pytest.approx(-0.009)
-    assert support_height(tray, 0.195, 0.0) == pytest.approx(0.015)
+    large, box = catalogue()["tray"], catalogue()["tea_box"]
+    assert support_height(large, 0.0, 0.0) == pytest.approx(-0.009)
+    assert support_height(large, 0.195, 0.0) == pytest.approx(0.015)
     assert support_height(box, 0.0, 0.0) == pytest.approx(0.040)
 
 
@@ -66,11 +68,11 @@ def test_what_is_moved_is_put_down_on_what_is_below_and_never_beside_the_table()
     simulation = Simulation(objects, ("tea_box", "tuna_can"))
     simulation.arrange({"tea_box": standing("tea_box", 0.6, 0.1), "tuna_can": standing("tuna_can", 0.6, -0.2)})
     for x, y, below in ((0.6, 0.1, objects["tea_box"].dimensions[2]), (0.7, -0.1, 0.0)):
-        layout = dict(zip(simulation.names, simulation.object_poses(), strict=True))
-        simulation.place("tuna_can", tabletop.moved("tuna_can", x, y, layout, objects))
+        layout = dict(zip(simulation.present, simulation.object_poses(), strict=True))
+        simulation.place("tuna_can", moved("tuna_can", (x, y), layout, objects, TABLE))
         can = simulation.object_poses()[1]
         bottom = can[2, 3] + objects["tuna_can"].bounds[0, 2]
-        assert np.allclose([*can[:2, 3], bottom], [x, y, tabletop.TABLE.height + below], atol=0.004)
+        assert np.allclose([*can[:2, 3], bottom], [x, y, TABLE.height + below], atol=0.004)
         assert can[2, 2] > 0.999
     with pytest.raises(Refused, match=r"x=0\.2 y=0: beside the table; valid: 0\.45 to 1\.15 and -0\.6 to 0\.6"):
-        tabletop.moved("tuna_can", 0.2, 0.0, layout, objects)
+        moved("tuna_can", (0.2, 0.0), layout, objects, TABLE)

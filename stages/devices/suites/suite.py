@@ -1,0 +1,101 @@
+"""What every suite is: objects on a table, of which a goal and a start scene are drawn until one is possible."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from stages.devices.suites.draft import Draft, shapes
+from stages.devices.suites.reach import stuck
+from stages.devices.tabletop import HIDDEN, TABLE, Layout
+from stages.messages import SensorErrors
+from stages.scene.catalogue import Catalogue
+
+Kind = Literal["goal", "start"]
+
+
+class Rejected(Exception):
+    """A draw that physics, reach or sight make impossible; the text says which, in a few words."""
+
+
+class Suite(ABC):
+    """A world of one suite: its objects, and scenes of them."""
+
+    names: tuple[str, ...]
+    """All objects that any scene has; a scene may do without some."""
+    table = TABLE
+
+    @abstractmethod
+    def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
+        """One draw of a scene.
+
+        Raises:
+            Rejected: it is impossible.
+        """
+
+    def errors(self, rng: np.random.Generator) -> SensorErrors | None:
+        """What is wrong with camera and encoders at one look; None where nothing is."""
+        return None
+
+
+class Drawn(Suite):
+    """A suite whose scenes are put together object by object, as a draft; nothing in them is written by hand."""
+
+    hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 0.8}
+    """Largest share of an object that others hide from the camera. What nobody sees cannot be shown as a goal."""
+
+    def __init__(self, catalogue: Catalogue, seed: int) -> None:
+        self.catalogue, self._shapes = catalogue, shapes(catalogue)
+        self.choose(np.random.default_rng([seed, 2]))
+
+    @abstractmethod
+    def choose(self, rng: np.random.Generator) -> None:
+        """Sets the names, and what else goal and start have in common."""
+
+    @abstractmethod
+    def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
+        """Puts the objects of a scene down; raises :class:`Rejected` where there is no room."""
+
+    def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
+        """Puts a draft together and tests whether the robot could take it apart."""
+        draft = Draft(self.catalogue, self._shapes, rng, self.table, self.hidden[kind])
+        self.draw(kind, draft, rng)
+        if stuck(draft.placed, draft.supports, self.table):
+            raise Rejected("out of reach")
+        return draft.layout
+
+
+def graspable(catalogue: Catalogue) -> list[str]:
+    """Labels of what the robot can move."""
+    return [name for name, item in catalogue.objects.items() if item.grasps]
+
+
+def put(draft: Draft, name: str, support: str = "table", *, near: str = "", resting: int = 0) -> None:
+    """Puts an object down.
+
+    Raises:
+        Rejected: it fits nowhere there.
+    """
+    if not draft.put(name, support, near=near, resting=resting):
+        raise Rejected("no room in sight")
+
+
+def put_somewhere(draft: Draft, name: str, rng: np.random.Generator, *, carried: float, beside: float) -> None:
+    """Puts an object on or in another one (a share ``carried`` of them), beside one, or anywhere on the table.
+
+    Raises:
+        Rejected: there is no room for it on the table either.
+    """
+    way = rng.random()
+    if way < carried and _put_on_any(draft, name, draft.carriers(), rng):
+        return
+    on_table = [other for other, support in draft.supports.items() if support == "table"]
+    if carried <= way < carried + beside and on_table and draft.put(name, near=on_table[rng.integers(len(on_table))]):
+        return
+    put(draft, name)
+
+
+def _put_on_any(draft: Draft, name: str, carriers: list[str], rng: np.random.Generator) -> bool:
+    return any(draft.put(name, carriers[k]) for k in rng.permutation(len(carriers))[:2])

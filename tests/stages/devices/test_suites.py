@@ -1,0 +1,143 @@
+"""Worlds of every suite: what the suite says of them, that they stand, and that the seed alone decides."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from runner.contract import Refused
+from runner.testing import run_stage
+from stages.devices import fetch
+from stages.devices.simulated_camera import SimulatedCamera
+from stages.devices.suites import kinds
+from stages.devices.suites.draft import Draft, shapes
+from stages.devices.suites.reach import stuck
+from stages.devices.tabletop import HIDDEN, TABLE
+from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.scene.catalogue import BUILT_IN, Catalogue
+from stages.scene.relations import Tolerances, supports
+from stages.scene.stance import Standing
+from stages.world import World
+from tests.stages.planning.scenes import catalogue
+
+CATALOGUE = Catalogue.shared(BUILT_IN)
+
+
+@cache
+def looks(suite: str, seed: int) -> tuple[Snapshot, Snapshot, str]:
+    """The goal and the start scene of a world, and what it said of them."""
+    said: list[str] = []
+    given = [message for kind in ("goal", "start") for message in (Arrangement(kind=kind), LookRequest(purpose=kind))]
+    world = World(World.Config(suite=suite, seed=seed))
+    found = run_stage(world, given, log=lambda text, _: said.append(text))
+    return found[1], found[3], "\n".join(said)
+
+
+def carried(snapshot: Snapshot) -> dict[str, str]:
+    """What carries each object in truth."""
+    shapes_of = shapes(CATALOGUE)
+    down = np.eye(4)
+    assert snapshot.T_base_table is not None
+    down[2, 3] = -snapshot.T_base_table[2, 3]
+    standing = [
+        Standing.at(name, shapes_of[name.rstrip("_23")], down @ T)
+        for name, T in zip(snapshot.names, snapshot.T_base_objects, strict=True)
+    ]
+    return {name: support.parent for name, support in supports(standing, Tolerances()).items()}
+
+
+def poses(snapshot: Snapshot) -> dict[str, np.ndarray]:
+    return dict(zip(snapshot.names, snapshot.T_base_objects, strict=True))
+
+
+def test_equal_seeds_give_equal_worlds() -> None:
+    first, again = looks("wild", 0), looks.__wrapped__("wild", 0)
+    for one, other in zip(first[:2], again[:2], strict=True):
+        assert one.names == other.names
+        np.testing.assert_array_equal(one.T_base_objects, other.T_base_objects)
+
+
+def test_wild_strangers_come_with_the_start() -> None:
+    goal, start, said = looks("wild", 0)
+    assert set(goal.names) < set(start.names)
+    assert "draws rejected: no room in sight" in said
+    assert (goal.T_base_objects[:, 2, 3] > TABLE.height - 0.001).all()
+
+
+def test_swapped_towers_stand_the_other_way_round() -> None:
+    goal, start, _ = looks("swap", 2)
+    above, below = carried(goal), carried(start)
+    tower = [(upper, lower) for upper, lower in above.items() if lower != "table"]
+    assert len(tower) == 2
+    assert all(below[lower] == upper for upper, lower in tower)
+
+
+def test_twins_are_equal_objects_with_names_of_their_own() -> None:
+    goal, start, _ = looks("twins", 2)
+    assert {"water_bottle", "water_bottle_2", "water_bottle_3"} <= set(goal.names) == set(start.names)
+
+
+def test_biased_cameras_see_something_else_than_they_say() -> None:
+    goal, start, _ = looks("biased", 0)
+    assert goal.errors is not None and start.errors is not None and goal.table_size is not None
+    assert 0.01 <= abs(goal.errors.depth - 1) <= 0.02
+    assert (goal.errors.gains != start.errors.gains).all() and (goal.errors.joints == start.errors.joints).all()
+    assert goal.T_base_table is not None and abs(goal.T_base_table[2, 3] - TABLE.height) > 0.001
+    camera = SimulatedCamera(CATALOGUE)
+    T_base_camera = fetch.camera_pose(goal.joint_names, goal.joint_positions)
+    _, depth = camera.image(goal, T_base_camera)
+    camera.close()
+    behind = T_base_camera[2, 3] - goal.T_base_table[2, 3]
+    said = behind / -T_base_camera[2, 2]
+    # In the middle of the image there is the table, or something on it.
+    assert depth.shape == (480, 640) and not np.isclose(depth[240, 320], said, atol=0.003)
+
+
+def test_biased_joints_go_where_they_are_told_by_their_encoders() -> None:
+    world = World(World.Config(suite="biased", seed=0))
+    read = RobotCommand(times=np.zeros(0), positions=np.zeros((0, 8)), velocities=np.zeros((0, 8)))
+    states = [found for found in run_stage(world, [Arrangement(kind="goal"), read]) if isinstance(found, RobotState)]
+    off = states[-1].positions - [*fetch.HOME.values(), *states[-1].positions[-2:]]
+    assert 0.0005 < np.abs(off[1:8]).max() < np.deg2rad(0.3) + 0.001
+
+
+def test_hidden_objects_are_in_the_goal_and_behind_others_at_the_start() -> None:
+    goal, start, _ = looks("hidden", 0)
+    assert set(goal.names) == set(start.names)
+    camera = SimulatedCamera(CATALOGUE)
+    T_base_camera = fetch.camera_pose(start.joint_names, start.joint_positions)
+
+    def least_seen(shown: Snapshot) -> float:
+        """Smallest share of an object's pixels that no other one hides."""
+        alone = [replace(shown, names=(name,), T_base_objects=T[None]) for name, T in poses(shown).items()]
+        bare = camera.image(replace(shown, names=(), T_base_objects=np.zeros((0, 4, 4))), T_base_camera)[1]
+        whole = camera.image(shown, T_base_camera)[1]
+        depths = [camera.image(one, T_base_camera)[1] for one in alone]
+        return min(float((np.abs(whole - d) < 1e-4)[d < bare - 1e-4].mean()) for d in depths)
+
+    assert least_seen(start) < min(0.3, least_seen(goal))
+    camera.close()
+
+
+def test_fallen_objects_lie_at_the_start_only() -> None:
+    goal, start, _ = looks("fallen", 0)
+    assert (goal.T_base_objects[:, 2, 2] > 0.99).all()
+    assert (start.T_base_objects[:, 2, 2] < 0.1).any()
+
+
+def test_what_stands_where_no_hand_fits_is_stuck() -> None:
+    draft = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), TABLE, HIDDEN)
+    assert draft.put_at("mug", "table", np.array([0.6, 0.0]), 0.0)
+    assert draft.put_at("soup_can", "table", np.array([0.6, -0.2]), 0.0)
+    assert stuck(draft.placed, draft.supports, TABLE) == set()
+    assert draft.put_at("salt_shaker", "mug", draft.placed["mug"].floor.mean(0), 0.0)
+    assert stuck(draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
+
+
+def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
+    with pytest.raises(Refused, match=r"world\.suite: no suite 'neat'; choose one of tray, wild, swap"):
+        World.Config(suite="neat")
+    with pytest.raises(Refused, match=r"world\.goal: suite wild draws its goals"):
+        World.Config(suite="wild", goal="tea")
+    assert set(kinds.DRAWN) == set(kinds.NAMES) - {"tray"}
