@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from stages.devices.suites.draft import Draft, shapes
-from stages.devices.suites.reach import stuck
 from stages.devices.tabletop import HIDDEN, TABLE, Layout
 from stages.messages import SensorErrors
 from stages.scene.catalogue import Catalogue
@@ -60,6 +59,9 @@ class Drawn(Suite):
 
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """Puts a draft together and tests whether the robot could take it apart."""
+        # Motion planning takes half a second to load; whoever only reads a graph does without.
+        from stages.devices.suites.reach import stuck
+
         draft = Draft(self.catalogue, self._shapes, rng, self.table, self.hidden[kind])
         self.draw(kind, draft, rng)
         if stuck(draft.placed, draft.supports, self.table):

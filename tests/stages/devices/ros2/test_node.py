@@ -45,8 +45,8 @@ def test_who_comes_late_gets_what_was_latched_and_not_what_was_volatile() -> Non
             keeps.put(talker.types.new(STRING, data=word))
             forgets.put(talker.types.new(STRING, data=word))
         listener.subscribe("kept", STRING, lambda one: latched.append(one.message.data), LATCHED)
+        wait_until(lambda: latched)  # which comes after "second" on the same link: that has gone through the router
         listener.subscribe("gone", STRING, lambda one: volatile.append(one.message.data))
-        wait_until(lambda: latched)
         assert talker.wait_for(forgets.endpoint, 5.0) == ""
         forgets.put(talker.types.new(STRING, data="third"))
         wait_until(lambda: volatile)

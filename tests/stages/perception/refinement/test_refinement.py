@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose, symmetry_angle
@@ -125,6 +126,7 @@ def offset(A: Floats, B: Floats) -> float:
 
 
 def digest() -> str:
+    torch.set_num_threads(1)  # as stages do: sums depend on how many share them
     seen = render({"soup_can": PLACED["soup_can"]})
     placed = [Placed("soup_can", seen.poses["soup_can"] @ NUDGE)]
     (can,) = SceneRefiner(CATALOGUE, RefinementSettings()).refine(seen.scene, image(seen, can=OVER), placed).objects
