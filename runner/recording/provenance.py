@@ -135,7 +135,9 @@ def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _parts(path: Path) -> list[Path]:
-    """The files that belong to a setting's file or folder; none where it is neither."""
+    """The files that belong to a setting's file or folder; none where it is neither, or all of the machine."""
+    if path == Path("/"):
+        return []
     if os.path.isdir(path):  # noqa: PTH112 - takes any text, and Path.is_dir() does not
         return sorted(inner for inner in itertools.islice(path.rglob("*"), HASHED_FILES) if inner.is_file())
     if not os.path.isfile(path):  # noqa: PTH113

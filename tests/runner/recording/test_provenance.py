@@ -89,3 +89,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason():
     """Readable for root, and yet it has nothing to read at its beginning."""
     graph = {"stages": {"sink": {"config": {"path": "/proc/self/mem"}}}}
     assert provenance.file_hashes(graph) == {"/proc/self/mem": "not hashed, Input/output error"}
+
+
+def test_a_slash_is_a_word_and_not_the_whole_machine():
+    assert provenance.file_hashes({"stages": {"camera": {"config": {"namespace": "/"}}}}) == {}
