@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -22,8 +22,7 @@ def upright(entry: CatalogueObject, x: float, y: float, yaw: float, height: floa
 
 def support_height(entry: CatalogueObject, x: float, y: float) -> float:
     """Height in the object frame on which something rests above (x, y), metres: a tray's floor, a box's top."""
-    tops = [_top(primitive) for primitive in entry.collision if _covers(primitive, x, y)]
-    return max(tops, default=float(entry.bounds[1, 2]))
+    return max(_tops(entry, x, y), default=float(entry.bounds[1, 2]))
 
 
 def moved(
@@ -44,14 +43,19 @@ def moved(
     corners = (np.array([*np.ndindex(3, 3)]) - 1) * entry.dimensions[:2] / 2
     heights = [_height(other, T, x + dx, y + dy) for dx, dy in corners.tolist() for other, T in others]
     yaw = np.arctan2(layout[name][1, 0], layout[name][0, 0])
-    return upright(entry, x, y, yaw, max(table.height, *heights))
+    return upright(entry, x, y, yaw, max([table.height, *heights]))
 
 
 def _height(entry: CatalogueObject, T_base_object: Floats, x: float, y: float) -> float:
     """Height of the highest surface of an object at (x, y) in the base frame, metres; minus infinity beside it."""
     local = inverse(T_base_object) @ [x, y, 0, 1]
-    tops = [_top(primitive) for primitive in entry.collision if _covers(primitive, local[0], local[1])]
-    return T_base_object[2, 3] + max(tops, default=-np.inf)
+    return T_base_object[2, 3] + max(_tops(entry, local[0], local[1]), default=-np.inf)
+
+
+def _tops(entry: CatalogueObject, x: float, y: float) -> Iterator[float]:
+    """Heights of the shapes that cover (x, y) in the object frame, metres."""
+    covering = (primitive for primitive in entry.collision if _covers(primitive, x, y))
+    return (float(one.T_object_primitive[2, 3] + one.size[-1] / 2) for one in covering)
 
 
 def _covers(primitive: Primitive, x: float, y: float) -> bool:
@@ -59,7 +63,3 @@ def _covers(primitive: Primitive, x: float, y: float) -> bool:
     if primitive.kind == "cylinder":
         return bool(np.hypot(local[0], local[1]) <= primitive.size[0])
     return bool((np.abs(local[:2]) <= np.array(primitive.size[:2]) / 2).all())
-
-
-def _top(primitive: Primitive) -> float:
-    return float(primitive.T_object_primitive[2, 3] + primitive.size[-1] / 2)
