@@ -59,6 +59,8 @@ GRIPPER = Gripper(
     link="gripper_link", joints=FINGER_JOINTS, open_width=0.1018, closed_width=0.0018, force=60.0, reach=0.0385
 )
 
+SHOULDER = (0.033, 0.0)
+"""Where the shoulder-pan axis stands in the base frame, metres."""
 CAMERA_FOCAL, CAMERA_SIZE = 540.0, (640, 480)
 """Of the head camera, pixels: 61 degrees across, as Fetch's PrimeSense Carmine."""
 

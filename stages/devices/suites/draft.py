@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from stages.devices import tabletop
+from stages.devices import fetch, tabletop
 from stages.devices.tabletop import Layout
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
@@ -27,7 +27,6 @@ _MIDDLE = 0.01
 """Metres from the edge of what carries it at which the middle of an object stands, at least."""
 _REACH = 0.75
 """Metres around the robot's shoulder beyond which nothing is drawn; what lies within may still be out of reach."""
-_SHOULDER = np.array([0.033, 0.0])
 _TRIES = 30
 _HIGHEST = 3
 """Objects in a stack."""
@@ -132,7 +131,7 @@ class Draft:
 
     def _is_carried(self, item: Standing, support: str) -> bool:
         """Wholly over the table or a hollow's floor, by its middle on a top; and not far beyond the robot's reach."""
-        if np.linalg.norm(item.T_table_stance[:2, 3] - _SHOULDER) > _REACH:
+        if np.linalg.norm(item.T_table_stance[:2, 3] - fetch.SHOULDER) > _REACH:
             return False
         surface = self._surface_of(support)
         if support == TABLE:

@@ -9,6 +9,7 @@ from itertools import combinations, permutations
 import numpy as np
 
 from runner.contract import Refused
+from stages.devices import fetch
 from stages.devices.suites.placing import support_height, upright
 from stages.devices.suites.suite import Kind, Suite
 from stages.devices.tabletop import TABLE, Layout, image_rectangle, is_inside_image, is_seen
@@ -20,7 +21,6 @@ TRAY = "tray"
 
 _NEAR, _FAR = 0.52, 0.80
 """Metres in front of the robot between which objects stand."""
-_SHOULDER = np.array([0.033, 0.0])
 _REACH = 0.72
 """Metres around the shoulder-pan axis within which objects are grasped and placed from the top."""
 _APART = 0.04
@@ -226,7 +226,7 @@ def _is_good(layout: Layout, standing: Iterable[str], together: set[frozenset[st
 
 
 def _reachable(T: Floats) -> bool:
-    return bool(np.linalg.norm(T[:2, 3] - _SHOULDER) <= _REACH and _NEAR <= T[0, 3] <= _FAR)
+    return bool(np.linalg.norm(T[:2, 3] - fetch.SHOULDER) <= _REACH and _NEAR <= T[0, 3] <= _FAR)
 
 
 def _gap(a: str, b: str, layout: Layout, catalogue: Catalogue) -> float:

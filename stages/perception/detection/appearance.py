@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from stages.perception.detection.backbone import SIDE, Backbone
+from stages.perception.rendering.rasteriser import Float32s
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Float32s = NDArray[np.float32]
 
 OUTLINE = 24
 """Cells along the outline that masks are compared by."""

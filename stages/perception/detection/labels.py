@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from stages.geometry.arrays import Floats
-from stages.perception.detection.appearance import Bytes, Float32s, Looks, square
+from stages.perception.detection.appearance import Bytes, Looks, square
 from stages.perception.detection.regions import Region
 from stages.perception.detection.views import Views, projected, unit
+from stages.perception.rendering.rasteriser import Float32s
 
 _WEIGHTS = {"middle": 2.0, "last": 1.0, "chroma": 0.5, "light": 0.1, "outline": 0.3, "size": 0.2, "top": 0.3}
 """What each likeness counts; all are 1 at best."""

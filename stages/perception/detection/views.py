@@ -17,9 +17,9 @@ from safetensors.numpy import save_file
 
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
-from stages.perception.detection.appearance import Float32s, Looks, Mask, Piece, square
+from stages.perception.detection.appearance import Looks, Mask, Piece, square
 from stages.perception.rendering.contact_sheet import looking_at
-from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
+from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.catalogue.mesh_shape import resting_rotations, transform
