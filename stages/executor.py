@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from runner.contract import Context, Refused, Stage
-from stages.devices import fetch, tabletop
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 
@@ -21,6 +22,7 @@ class Executor(Stage):
         """``attempts``: how many grasps are tried on an object before the transfer is reported as failed."""
 
         catalogue: Path = BUILT_IN
+        robot: Path = ROBOT
         attempts: int = 3
 
         def __post_init__(self) -> None:
@@ -33,7 +35,7 @@ class Executor(Stage):
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._robot = fetch.robot_model()
+        self._robot = read_robot(config.robot)
         self._transfers = TransferRoutine
         self._routine: Routine | None = None
         self._ctx: Context | None = None
@@ -44,7 +46,7 @@ class Executor(Stage):
         routine = self._transfers(
             transfer_request,
             robot=self._robot,
-            table=tabletop.TABLE,
+            table=self._robot.table,
             catalogue=self._catalogue,
             rng=ctx.rng,
             attempts=self._config.attempts,

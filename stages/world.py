@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
-from stages.devices import fetch
 from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.placing import moved
@@ -18,6 +17,8 @@ from stages.devices.tabletop import Layout
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Arrange, Arrangement, LookRequest, Move, RobotCommand, RobotState, Snapshot
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01
@@ -37,6 +38,7 @@ class World(Stage):
         """``suite`` is the kind of scenes, ``seed`` draws them."""
 
         catalogue: Path = BUILT_IN
+        robot: Path = ROBOT
         suite: str = "tray"
         seed: int = 0
         goal: str = "auto"
@@ -50,11 +52,12 @@ class World(Stage):
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._suite = kinds.suite(config.suite, self._catalogue, config.seed, goal=config.goal)
+        self._robot = read_robot(config.robot)
+        self._suite = kinds.suite(config.suite, self._catalogue, self._robot, config.seed, goal=config.goal)
         self._looks = 0
         errors = self._suite.errors(np.random.default_rng(config.seed))
-        self._beyond = np.zeros(len(fetch.JOINT_NAMES)) if errors is None else errors.joints
-        self._simulation = Simulation(self._catalogue, self._suite.names, self._suite.table)
+        self._beyond = np.zeros(len(self._robot.joint_names)) if errors is None else errors.joints
+        self._simulation = Simulation(self._catalogue, self._robot, self._suite.names, self._suite.table)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
@@ -85,7 +88,7 @@ class World(Stage):
         return Snapshot(
             names=self._simulation.present,
             T_base_objects=self._simulation.object_poses(),
-            joint_names=fetch.JOINT_NAMES,
+            joint_names=self._robot.joint_names,
             joint_positions=self._encoders(),
             time=self._simulation.time,
             purpose=look_request.purpose,
@@ -98,7 +101,7 @@ class World(Stage):
         """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders."""
         error = 0.0
         if len(robot_command.times):
-            beyond = [self._beyond[fetch.JOINT_NAMES.index(name)] for name in robot_command.joint_names]
+            beyond = [self._beyond[self._robot.joint_names.index(name)] for name in robot_command.joint_names]
             error = self._simulation.follow(
                 robot_command.joint_names,
                 robot_command.times,
@@ -140,7 +143,7 @@ class World(Stage):
 
     def _state(self, tracking_error: float = 0.0) -> RobotState:
         return RobotState(
-            joint_names=fetch.JOINT_NAMES,
+            joint_names=self._robot.joint_names,
             positions=self._encoders(),
             gripper_width=self._simulation.gripper_width(),
             time=self._simulation.time,

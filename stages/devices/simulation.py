@@ -1,4 +1,4 @@
-"""The simulated world: Fetch at a table with catalogue objects, in MuJoCo."""
+"""The simulated world: a robot at a table with catalogue objects, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from stages.devices import fetch
-from stages.devices.tabletop import TABLE
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.collision import Table, add_primitives, add_table, quaternion
+from stages.planning.collision import add_primitives, add_table, quaternion
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of
 
@@ -35,15 +34,16 @@ class Simulation:
     coupled as on the real gripper keep what is held from creeping.
     """
 
-    def __init__(self, catalogue: Catalogue, names: tuple[str, ...], table: Table = TABLE) -> None:
-        self._names = self.present = names
-        spec = fetch.specification()
+    def __init__(self, catalogue: Catalogue, robot: Robot, names: tuple[str, ...], table: Table) -> None:
+        self._robot, self._names, self.present = robot, names, names
+        spec = robot.specification()
         option = spec.option
         option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
         # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
         option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+        floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+        floor.pos = [0, 0, robot.floor]
         add_table(spec, table)
         for name in names:
             _add_object(spec, name, catalogue[label_of(name, catalogue)])
@@ -69,7 +69,7 @@ class Simulation:
             self._put(name, T)
         self.present = tuple(name for name in self._names if name in layout)
         for k, name in enumerate(name for name in self._names if name not in layout):
-            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, 0.1
+            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, self._robot.floor + 0.1
         self.run(settle)
 
     def place(self, name: str, T_base_object: Floats, *, settle: float = 1.0) -> None:
@@ -89,7 +89,7 @@ class Simulation:
 
     def follow(self, joint_names: tuple[str, ...], times: Floats, positions: Floats, velocities: Floats) -> float:
         """Follows a joint trajectory (T, T x J, T x J) with velocity feed-forward; returns the largest joint error."""
-        actuators = np.array([self._model.actuator(name).id for name in joint_names])
+        actuators = np.array([self._actuators[name] for name in joint_names])
         addresses = np.array([self._model.joint(name).qposadr[0] for name in joint_names])
         lag = -self._model.actuator_biasprm[actuators, 2] / self._model.actuator_gainprm[actuators, 0]
         targets, rates = _resample(times, positions, velocities)
@@ -104,7 +104,7 @@ class Simulation:
 
     def move_gripper(self, width: float) -> None:
         """Drives the fingers towards ``width`` metres apart; they stall with limited force at what is between them."""
-        start, end = self._data.ctrl[self._fingers[0]], fetch.GRIPPER.finger(width)
+        start, end = self._data.ctrl[self._fingers].copy(), self._grip(width)
         steps = round(_GRIPPER_RAMP / _TIMESTEP)
         for k in range(1, steps + 1):
             self._data.ctrl[self._fingers] = start + (end - start) * k / steps
@@ -112,12 +112,13 @@ class Simulation:
         self.run(_GRIPPER_HOLD)
 
     def encoders(self) -> Floats:
-        """Positions of :data:`stages.devices.fetch.JOINT_NAMES`."""
+        """Positions of the joints that :attr:`stages.robots.Robot.joint_names` names."""
         return self._data.qpos[self._joints].copy()
 
     def gripper_width(self) -> float:
         """Metres between the fingers."""
-        return sum(fetch.GRIPPER.width(float(self._data.joint(name).qpos[0])) for name in fetch.FINGER_JOINTS) / 2
+        gripper = self._robot.gripper
+        return sum(gripper.width(float(self._data.joint(name).qpos[0])) for name in gripper.fingers) / 2
 
     def object_poses(self) -> Floats:
         """N x 4 x 4: T_base_object of every object that is ``present``, in that order."""
@@ -125,17 +126,29 @@ class Simulation:
         return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies])
 
     def _go_home(self) -> None:
-        for name, position in fetch.HOME.items():
+        gripper = self._robot.gripper
+        for name, position in self._robot.posture.items():
             self._data.joint(name).qpos[0] = position
-            self._data.actuator(name).ctrl[0] = position
-        finger = fetch.GRIPPER.finger(fetch.GRIPPER.open_width)
-        for name in fetch.FINGER_JOINTS:
-            self._data.joint(name).qpos[0] = finger
-        self._data.ctrl[self._fingers] = finger
+            self._data.ctrl[self._actuators[name]] = position
+        for name, position in gripper.posture(gripper.open_width).items():
+            self._data.joint(name).qpos[0] = position
+        self._data.ctrl[self._fingers] = self._grip(gripper.open_width)
+
+    def _grip(self, width: float) -> Floats:
+        """What is commanded to the actuators of the fingers; their own range need not be that of the joints."""
+        gain, bias = self._model.actuator_gainprm[self._fingers, 0], self._model.actuator_biasprm[self._fingers, 1]
+        return self._robot.gripper.finger_position(width) * (-bias / gain)
 
     def _index(self) -> None:
-        self._joints = np.array([self._model.joint(name).qposadr[0] for name in fetch.JOINT_NAMES])
-        self._fingers = np.array([self._model.actuator(name).id for name in fetch.FINGER_JOINTS])
+        model, joint = self._model, mujoco.mjtTrn.mjTRN_JOINT
+        self._joints = np.array([model.joint(name).qposadr[0] for name in self._robot.joint_names])
+        moved = {
+            k: model.joint(model.actuator_trnid[k, 0]).name
+            for k in range(model.nu)
+            if model.actuator_trntype[k] == joint
+        }
+        self._actuators = {name: k for k, name in moved.items()}
+        self._fingers = np.array([k for k in range(model.nu) if moved.get(k) not in self._robot.posture])
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject) -> None:

@@ -12,10 +12,10 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.task import FailedStage
-from stages.planning.collision import CollisionWorld, Table
+from stages.planning.collision import CollisionWorld
 from stages.planning.motion import free_motion, straight_motion, time_parameterise
 from stages.planning.pick_place import HOVER, LIFT, RELEASE, ROOM, Errand, PickPlace, PickPlacePlanner, opening, raised
-from stages.planning.robot import RobotModel
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 
 Routine = Generator[RobotCommand, RobotState, "Outcome"]
@@ -56,7 +56,7 @@ class TransferRoutine:
         self,
         request: TransferRequest,
         *,
-        robot: RobotModel,
+        robot: Robot,
         table: Table,
         catalogue: Catalogue,
         rng: np.random.Generator,

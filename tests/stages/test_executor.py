@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from runner.contract import Level, Refused
-from stages.devices import fetch, tabletop
 from stages.devices.suites import tray
 from stages.executor import Executor
 from stages.geometry.arrays import Floats
@@ -15,7 +14,7 @@ from stages.geometry.poses import exp_so3
 from stages.messages import Arrangement, LookRequest, Outcome, RobotCommand, SceneGraph, Transfer, TransferRequest
 from stages.messages.scene import SceneObject
 from stages.world import World
-from tests.stages.planning.scenes import CATALOGUE_FILE, standing
+from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, TABLE, standing
 
 
 @dataclass
@@ -57,7 +56,7 @@ class Bench:
     def is_home(self) -> bool:
         state = self.world.on_robot_command(RobotCommand(times=np.zeros(0), positions=NONE, velocities=NONE))
         where = dict(zip(state.joint_names, state.positions, strict=True))
-        return state.gripper_width > 0.09 and all(abs(where[n] - p) < 0.02 for n, p in fetch.HOME.items())
+        return state.gripper_width > 0.09 and all(abs(where[n] - p) < 0.02 for n, p in ROBOT.posture.items())
 
 
 NONE = np.zeros((0, 8))
@@ -65,7 +64,7 @@ NONE = np.zeros((0, 8))
 
 def graph(poses: dict[str, Floats]) -> SceneGraph:
     T_base_table = np.eye(4)
-    T_base_table[2, 3] = tabletop.TABLE.height
+    T_base_table[2, 3] = TABLE.height
     return SceneGraph(
         objects=tuple(SceneObject(name=name, label=name, T_base_object=T) for name, T in poses.items()),
         virtual_objects=(),
@@ -87,7 +86,7 @@ def misperceived(T: Floats, rng: np.random.Generator) -> Floats:
 @pytest.mark.slow
 def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
     bench, rng = Bench(0, "tea"), np.random.default_rng(1)
-    goal = tray.sample_goal("tea", bench.world._catalogue, rng)  # pyright: ignore[reportPrivateUsage]
+    goal = tray.sample_goal("tea", bench.world._catalogue, ROBOT, rng)  # pyright: ignore[reportPrivateUsage]
     for name, destination in (("tea_box", "tray"), ("soup_can", "tea_box")):
         before = bench.poses()
         perceived = {key: misperceived(T, rng) for key, T in before.items()}

@@ -8,8 +8,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from stages.devices.suites.draft import Draft, shapes
-from stages.devices.tabletop import HIDDEN, TABLE, Layout
+from stages.devices.tabletop import HIDDEN, Layout
 from stages.messages import SensorErrors
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
 
 Kind = Literal["goal", "start"]
@@ -24,7 +25,7 @@ class Suite(ABC):
 
     names: tuple[str, ...]
     """All objects that any scene has; a scene may do without some."""
-    table = TABLE
+    table: Table
 
     @abstractmethod
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
@@ -45,8 +46,8 @@ class Drawn(Suite):
     hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 0.8}
     """Largest share of an object that others hide from the camera. What nobody sees cannot be shown as a goal."""
 
-    def __init__(self, catalogue: Catalogue, seed: int) -> None:
-        self.catalogue, self._shapes = catalogue, shapes(catalogue)
+    def __init__(self, catalogue: Catalogue, robot: Robot, seed: int) -> None:
+        self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
         self.choose(np.random.default_rng([seed, 2]))
 
     @abstractmethod
@@ -62,9 +63,9 @@ class Drawn(Suite):
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.devices.suites.reach import stuck
 
-        draft = Draft(self.catalogue, self._shapes, rng, self.table, self.hidden[kind])
+        draft = Draft(self.catalogue, self._shapes, rng, robot=self.robot, table=self.table, hidden=self.hidden[kind])
         self.draw(kind, draft, rng)
-        if stuck(draft.placed, draft.supports, self.table):
+        if stuck(self.robot, draft.placed, draft.supports, self.table):
             raise Rejected("out of reach")
         return draft.layout
 

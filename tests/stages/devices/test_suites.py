@@ -8,18 +8,17 @@ from msgspec.structs import replace
 
 from runner.contract import Refused
 from runner.testing import run_stage
-from stages.devices import fetch
 from stages.devices.simulated_camera import SimulatedCamera
 from stages.devices.suites import kinds
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.suites.reach import stuck
-from stages.devices.tabletop import HIDDEN, TABLE
+from stages.devices.tabletop import HIDDEN
 from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.relations import Tolerances, supports
 from stages.scene.stance import Standing
 from stages.world import World
-from tests.stages.planning.scenes import catalogue
+from tests.stages.planning.scenes import ROBOT, TABLE, catalogue
 
 CATALOGUE = Catalogue.shared(BUILT_IN)
 
@@ -84,8 +83,8 @@ def test_biased_cameras_see_something_else_than_they_say() -> None:
     assert 0.01 <= abs(goal.errors.depth - 1) <= 0.02
     assert (goal.errors.gains != start.errors.gains).all() and (goal.errors.joints == start.errors.joints).all()
     assert goal.T_base_table is not None and abs(goal.T_base_table[2, 3] - TABLE.height) > 0.001
-    camera = SimulatedCamera(CATALOGUE)
-    T_base_camera = fetch.camera_pose(goal.joint_names, goal.joint_positions)
+    camera = SimulatedCamera(CATALOGUE, ROBOT)
+    T_base_camera = ROBOT.camera_pose(goal.joint_names, goal.joint_positions)
     _, depth = camera.image(goal, T_base_camera)
     camera.close()
     behind = T_base_camera[2, 3] - goal.T_base_table[2, 3]
@@ -98,15 +97,15 @@ def test_biased_joints_go_where_they_are_told_by_their_encoders() -> None:
     world = World(World.Config(suite="biased", seed=0))
     read = RobotCommand(times=np.zeros(0), positions=np.zeros((0, 8)), velocities=np.zeros((0, 8)))
     states = [found for found in run_stage(world, [Arrangement(kind="goal"), read]) if isinstance(found, RobotState)]
-    off = states[-1].positions - [*fetch.HOME.values(), *states[-1].positions[-2:]]
+    off = states[-1].positions - [*ROBOT.posture.values(), *states[-1].positions[-2:]]
     assert 0.0005 < np.abs(off[1:8]).max() < np.deg2rad(0.3) + 0.001
 
 
 def test_hidden_objects_are_in_the_goal_and_behind_others_at_the_start() -> None:
     goal, start, _ = looks("hidden", 0)
     assert set(goal.names) == set(start.names)
-    camera = SimulatedCamera(CATALOGUE)
-    T_base_camera = fetch.camera_pose(start.joint_names, start.joint_positions)
+    camera = SimulatedCamera(CATALOGUE, ROBOT)
+    T_base_camera = ROBOT.camera_pose(start.joint_names, start.joint_positions)
 
     def least_seen(shown: Snapshot) -> float:
         """Smallest share of an object's pixels that no other one hides."""
@@ -127,12 +126,12 @@ def test_fallen_objects_lie_at_the_start_only() -> None:
 
 
 def test_what_stands_where_no_hand_fits_is_stuck() -> None:
-    draft = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), TABLE, HIDDEN)
+    draft = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=HIDDEN)
     assert draft.put_at("mug", "table", np.array([0.6, 0.0]), 0.0)
     assert draft.put_at("soup_can", "table", np.array([0.6, -0.2]), 0.0)
-    assert stuck(draft.placed, draft.supports, TABLE) == set()
+    assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == set()
     assert draft.put_at("salt_shaker", "mug", draft.placed["mug"].floor.mean(0), 0.0)
-    assert stuck(draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
+    assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
 
 
 def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
