@@ -166,13 +166,10 @@ class CollisionWorld:
             self._model.geom_contype[geoms] = before
 
     def _compile(self, table: Table, objects: Mapping[str, tuple[CatalogueObject, Floats]]) -> Any:
-        spec = self.robot.specification()
+        spec = self.robot.specification(seen=False)
         hand = spec.body(self.robot.hand)
         links = {hand.name, *(body.name for body in hand.find_all(mujoco.mjtObj.mjOBJ_BODY))}
-        for geom in list(spec.geoms):
-            if not geom.contype and not geom.conaffinity:
-                spec.delete(geom)  # for the eye only
-                continue
+        for geom in spec.geoms:
             near_hand = 0 if geom.parent.name in links else _HELD
             geom.contype, geom.conaffinity = _ROBOT, _ROBOT | _NEAR_ROBOT | near_hand
         obstacles = [add_table(spec, table)]

@@ -33,13 +33,16 @@ CROWDED = 0.08
 ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
 """Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
 
+ANYWHERE = (-10.0, 10.0)
+"""Metres: no limit beside the robot's own."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workspace:
     """Where to place, in the base frame, and how much room objects need; metres."""
 
-    x: tuple[float, float] = (-np.inf, np.inf)
-    y: tuple[float, float] = (-np.inf, np.inf)
+    x: tuple[float, float] = ANYWHERE
+    y: tuple[float, float] = ANYWHERE
     """Narrower than the area in which the robot places, where they are."""
     clearance: float = 0.005
     """Least gap between footprints."""

@@ -138,7 +138,8 @@ class TransferRoutine:
         hand = plan.place.hand
         state = yield self._command(f"lower {world.carried}", plan.place.lower, speed=_SLOW)
         q = yield from self._lower_until_contact(world, state, plan.place.lower[-1], hand.T_base_hand)
-        held, wanted = state.gripper_width, state.gripper_width + 2 * RELEASE
+        held = state.gripper_width
+        wanted = min(held + 2 * RELEASE, self._robot.gripper.open_width)
         state = yield self._command(f"let go of {world.carried}", width=wanted)
         left = world.hand(q) @ inverse(plan.pick.hand.T_object_hand)
         world.move(left)
@@ -148,7 +149,7 @@ class TransferRoutine:
         yield self._command("open the hand", width=self._robot.gripper.open_width)
         world.set_width(self._robot.gripper.open_width)
         failure = yield from self._home(world, retreat[-1])
-        if state.gripper_width < held + RELEASE:
+        if state.gripper_width < (held + wanted) / 2:
             return "release", f"the hand opened to {1e3 * state.gripper_width:.0f} mm of {1e3 * wanted:.0f}"
         self._tally.T_base_object = left
         return failure

@@ -13,7 +13,7 @@ from runner.contract import Refused
 from stages.robots.model import Model, Part, Servo
 
 
-def specification(model: Model) -> mujoco.MjSpec:
+def specification(model: Model, *, seen: bool = True) -> mujoco.MjSpec:
     """The robot alone; its controllers compensate its own weight.
 
     Raises:
@@ -36,7 +36,19 @@ def specification(model: Model) -> mujoco.MjSpec:
         spec.add_exclude(bodyname1=first, bodyname2=second)
     for geom in spec.geoms:
         geom.margin = 0
+    if not seen:
+        _leave_out_unfelt(spec)
     return spec
+
+
+def _leave_out_unfelt(spec: mujoco.MjSpec) -> None:
+    for geom in list(spec.geoms):
+        if not geom.contype and not geom.conaffinity:
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in list(spec.meshes):
+        if mesh.name not in used:
+            spec.delete(mesh)
 
 
 def assembled(model: Model) -> mujoco.MjSpec:
@@ -49,11 +61,13 @@ def assembled(model: Model) -> mujoco.MjSpec:
     for part, other in zip(model.parts[1:], others, strict=True):
         # The simulated world sets the options; where parts differ in them MuJoCo would warn.
         other.option = spec.option
+        if not part.on:
+            spec.attach(other, prefix=part.prefix, frame=spec.worldbody.add_frame())
+            continue
         site = spec.site(part.on)
         if site is None:
-            raise Refused(
-                f"{part.file}: no site '{part.on}' to mount it on; valid: {', '.join(s.name for s in spec.sites)}"
-            )
+            sites = ", ".join(site.name for site in spec.sites)
+            raise Refused(f"{part.file}: no site '{part.on}' to mount it on; valid: {sites}")
         spec.attach(other, prefix=part.prefix, site=site)
     for name in model.removed:
         element = spec.body(name) or spec.joint(name)

@@ -61,7 +61,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _model(root: Section) -> Model:
-    parts = tuple(_part(section, first=k == 0) for k, section in enumerate(root.sections("model")))
+    parts = tuple(_part(section) for section in root.sections("model"))
     if not parts:
         root.refuse("at least one MJCF or URDF file is needed", "model")
     gripper = root.section("gripper")
@@ -78,7 +78,7 @@ def _model(root: Section) -> Model:
     )
 
 
-def _part(section: Section, *, first: bool) -> Part:
+def _part(section: Section) -> Part:
     section.only("file", "folder", "mjcf", "without", "on", "prefix")
     text = section.text("mjcf", "")
     key = "folder" if text else "file"
@@ -86,7 +86,7 @@ def _part(section: Section, *, first: bool) -> Part:
         file=_located(section, key) if key in section.values or not text else section.file.parent,
         text=text,
         without=section.text("without", ""),
-        on="" if first else section.text("on"),
+        on=section.text("on", ""),
         prefix=section.text("prefix", ""),
     )
 

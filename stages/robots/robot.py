@@ -140,8 +140,10 @@ class Robot:
         """Where the arm and what stands still are at home."""
         return dict(zip(self.joints, self.home.tolist(), strict=True)) | self.still
 
-    def specification(self) -> mujoco.MjSpec:
+    def specification(self, *, seen: bool = True) -> mujoco.MjSpec:
         """A new MuJoCo specification of the robot alone, with its actuators; the world frame is the base frame.
+
+        Without ``seen``, shapes that are only for the eye are left out.
 
         Raises:
             Refused: a file of the model is missing or cannot be read.
@@ -149,7 +151,7 @@ class Robot:
         # MuJoCo takes a third of a second to load; whoever only reads a description does without.
         from stages.robots.assembly import specification
 
-        return specification(self.model)
+        return specification(self.model, seen=seen)
 
     @cached_property
     def body(self) -> Body:
