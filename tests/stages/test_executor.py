@@ -13,8 +13,9 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
 from stages.messages import Arrangement, LookRequest, Outcome, RobotCommand, SceneGraph, Transfer, TransferRequest
 from stages.messages.scene import SceneObject
+from stages.robots import BUILT_IN, read_robot
 from stages.world import World
-from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, TABLE, standing
+from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, standing
 
 
 @dataclass
@@ -31,10 +32,10 @@ class StepContext:
 class Bench:
     """World and executor without a runner between them."""
 
-    def __init__(self, seed: int, goal: str) -> None:
-        self.ctx = StepContext(np.random.default_rng(seed))
-        self.world = World(World.Config(catalogue=CATALOGUE_FILE, seed=seed, goal=goal))
-        self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, attempts=2))
+    def __init__(self, seed: int, goal: str, robot: Path = BUILT_IN) -> None:
+        self.ctx, self.robot = StepContext(np.random.default_rng(seed)), read_robot(robot)
+        self.world = World(World.Config(catalogue=CATALOGUE_FILE, robot=robot, seed=seed, goal=goal))
+        self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, robot=robot, attempts=2))
         self.world.on_arrangement(Arrangement(kind="start"), self.ctx)
 
     def poses(self) -> dict[str, Floats]:
@@ -45,7 +46,7 @@ class Bench:
         transfer = Transfer(
             object=name, source="table", destination=destination, T_base_targets=target[None], pick="", place=""
         )
-        request = TransferRequest(transfer=transfer, scene=graph(poses), number=1)
+        request = TransferRequest(transfer=transfer, scene=graph(poses, self.robot.table.height), number=1)
         answer = self.executor.on_transfer_request(request, self.ctx)
         while isinstance(answer, RobotCommand):
             following = self.executor.on_robot_state(self.world.on_robot_command(answer), self.ctx)
@@ -56,15 +57,16 @@ class Bench:
     def is_home(self) -> bool:
         state = self.world.on_robot_command(RobotCommand(times=np.zeros(0), positions=NONE, velocities=NONE))
         where = dict(zip(state.joint_names, state.positions, strict=True))
-        return state.gripper_width > 0.09 and all(abs(where[n] - p) < 0.02 for n, p in ROBOT.posture.items())
+        is_open = state.gripper_width > 0.9 * self.robot.gripper.open_width
+        return is_open and all(abs(where[n] - p) < 0.02 for n, p in self.robot.posture.items())
 
 
 NONE = np.zeros((0, 8))
 
 
-def graph(poses: dict[str, Floats]) -> SceneGraph:
+def graph(poses: dict[str, Floats], height: float) -> SceneGraph:
     T_base_table = np.eye(4)
-    T_base_table[2, 3] = TABLE.height
+    T_base_table[2, 3] = height
     return SceneGraph(
         objects=tuple(SceneObject(name=name, label=name, T_base_object=T) for name, T in poses.items()),
         virtual_objects=(),
@@ -103,6 +105,19 @@ def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
         assert all(np.linalg.norm(after[o][:3, 3] - before[o][:3, 3]) < 0.01 for o in others)
         assert bench.is_home()
     assert any("grasped" in line for line in bench.ctx.lines)
+
+
+@pytest.mark.parametrize("robot", ["ur5e.yaml", "panda.yaml"])
+def test_other_robots_pick_and_place_by_their_descriptions_alone(robot: str) -> None:
+    bench = Bench(0, "tea", BUILT_IN.with_name(robot))
+    target = standing("sugar_box", 0.34, -0.08, height=bench.robot.table.height)
+    before = bench.poses()
+    outcome = bench.transfer(before, "sugar_box", "table", target)
+    assert outcome.success, outcome.reason
+    after = bench.poses()
+    np.testing.assert_allclose(after["sugar_box"], target, atol=0.01)
+    assert all(np.linalg.norm((after[o] - before[o])[:3, 3]) < 0.01 for o in set(after) - {"sugar_box"})
+    assert bench.is_home()
 
 
 def test_an_unreachable_object_fails_in_ik() -> None:
