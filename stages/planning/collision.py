@@ -181,7 +181,7 @@ class CollisionWorld:
         gripper = self.robot.gripper
         T_link_hand = gripper.T_link_hand
         hand = spec.body(gripper.link).add_body(
-            name="hand", pos=T_link_hand[:3, 3], quat=quaternion(T_link_hand[:3, :3])
+            name="hand frame", pos=T_link_hand[:3, 3], quat=quaternion(T_link_hand[:3, :3])
         )
         for geom in add_primitives(hand.add_body(name="held"), objects[self.carried][0].collision):
             geom.contype, geom.conaffinity, geom.mass = 0, 0, 1e-6
@@ -192,7 +192,7 @@ class CollisionWorld:
         self._q = np.array([joint.qposadr[0] for joint in joints])
         self._v = np.array([joint.dofadr[0] for joint in joints])
         self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.gripper.posture(0.0)])
-        self._hand = model.body("hand").id
+        self._hand = model.body("hand frame").id
         # A joint without limits turns freely; half a turn either way reaches every angle.
         limits = [model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.pi, np.pi) for j in joints]
         self.lower, self.upper = np.array(limits).T

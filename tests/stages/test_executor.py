@@ -62,6 +62,8 @@ class Bench:
 
 
 NONE = np.zeros((0, 8))
+OTHERS = [BUILT_IN.with_name("ur5e.yaml"), BUILT_IN.with_name("panda.yaml"), Path(__file__).parent / "robots" / "arm.yaml"]
+"""Two that come with the package, and one that is a URDF."""
 
 
 def graph(poses: dict[str, Floats], height: float) -> SceneGraph:
@@ -107,9 +109,9 @@ def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
     assert any("grasped" in line for line in bench.ctx.lines)
 
 
-@pytest.mark.parametrize("robot", ["ur5e.yaml", "panda.yaml"])
-def test_other_robots_pick_and_place_by_their_descriptions_alone(robot: str) -> None:
-    bench = Bench(0, "tea", BUILT_IN.with_name(robot))
+@pytest.mark.parametrize("robot", OTHERS, ids=lambda robot: robot.stem)
+def test_other_robots_pick_and_place_by_their_descriptions_alone(robot: Path) -> None:
+    bench = Bench(0, "tea", robot)
     target = standing("sugar_box", 0.34, -0.08, height=bench.robot.table.height)
     before = bench.poses()
     outcome = bench.transfer(before, "sugar_box", "table", target)
