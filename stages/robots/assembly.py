@@ -12,6 +12,8 @@ import numpy as np
 from runner.contract import Refused
 from stages.robots.model import Model, Part, Servo
 
+_PACKAGE = "package://"
+
 
 def specification(model: Model, *, seen: bool = True) -> mujoco.MjSpec:
     """The robot alone; its controllers compensate its own weight.
@@ -84,6 +86,9 @@ def _read(part: Part) -> mujoco.MjSpec:
         raise Refused(f"{part.file}: MuJoCo cannot read the model: {error}") from error
     # Frames that a URDF fixes to others keep their names.
     spec.compiler.fusestatic = False
+    for mesh in spec.meshes:
+        if mesh.file.startswith(_PACKAGE):
+            mesh.file = str(part.packages / mesh.file.removeprefix(_PACKAGE))
     return spec
 
 

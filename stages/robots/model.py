@@ -22,6 +22,8 @@ class Part:
     """Site of an earlier part that this one is mounted on; empty where it stands in the base frame."""
     prefix: str = ""
     """Put before all names of this part."""
+    packages: Path = Path()
+    """Where the packages lie whose meshes a URDF names (``package://NAME/...``)."""
 
 
 @dataclass(frozen=True)

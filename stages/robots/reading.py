@@ -79,7 +79,7 @@ def _model(root: Section) -> Model:
 
 
 def _part(section: Section) -> Part:
-    section.only("file", "folder", "mjcf", "without", "on", "prefix")
+    section.only("file", "folder", "mjcf", "without", "on", "prefix", "packages")
     text = section.text("mjcf", "")
     key = "folder" if text else "file"
     return Part(
@@ -88,6 +88,7 @@ def _part(section: Section) -> Part:
         without=section.text("without", ""),
         on=section.text("on", ""),
         prefix=section.text("prefix", ""),
+        packages=_located(section, "packages") if "packages" in section.values else section.file.parent,
     )
 
 

@@ -62,7 +62,11 @@ class Bench:
 
 
 NONE = np.zeros((0, 8))
-OTHERS = [BUILT_IN.with_name("ur5e.yaml"), BUILT_IN.with_name("panda.yaml"), Path(__file__).parent / "robots" / "arm.yaml"]
+OTHERS = [
+    BUILT_IN.with_name("ur5e.yaml"),
+    BUILT_IN.with_name("panda.yaml"),
+    Path(__file__).parent / "robots" / "arm.yaml",
+]
 """Two that come with the package, and one that is a URDF."""
 
 

@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh.creation
 
 import stages.robots
 from runner.contract import Refused
+from stages.devices.check_robot import report
 from stages.robots import Robot, read_robot
 
+HERE = Path(__file__).parent
 FOLDER = Path(stages.robots.__file__).parent
 ALL = sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
@@ -83,6 +86,24 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path
     file.write_text((FOLDER / "fetch.yaml").read_text().replace(old, new, 1))
     with pytest.raises(Refused, match=message):
         read_robot(file)
+
+
+def test_a_description_is_tried_before_it_is_used() -> None:
+    tried = "\n".join(report(read_robot(HERE / "arm.yaml")))
+    assert "6 moved, 0 still, 2 of the gripper" in tried
+    assert "at home  free" in tried
+    assert "reach    42 of 42" in tried
+    assert "sees all of the workspace" in tried
+
+
+def test_meshes_of_a_urdf_are_found_in_its_packages(tmp_path: Path) -> None:
+    (tmp_path / "lab_arm" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((0.05, 0.16, 0.03)).export(tmp_path / "lab_arm" / "meshes" / "hand.stl")
+    for name in ("arm.yaml", "arm.urdf"):
+        mesh = '<mesh filename="package://lab_arm/meshes/hand.stl"/>'
+        (tmp_path / name).write_text((HERE / name).read_text().replace('<box size="0.05 0.16 0.03"/>', mesh))
+    (hand,) = [mesh for link, mesh in read_robot(tmp_path / "arm.yaml").body.meshes if link == "hand"]
+    np.testing.assert_allclose(np.ptp(hand.vertices, axis=0), (0.05, 0.16, 0.03), atol=1e-6)
 
 
 def test_no_source_names_a_robot() -> None:
