@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +28,7 @@ def read_robot(path: Path) -> Robot:
     Raises:
         Refused: naming file, line, key and valid choices.
     """
-    root = read_section(path)
+    root = _whole(path)
     root.only(
         "model", "remove", "change", "touching", "joints", "still", "gripper", "camera", "table", "floor", "workspace"
     )
@@ -55,6 +56,16 @@ def read_robot(path: Path) -> Robot:
     )
     _check(root, robot)
     return robot
+
+
+def _whole(path: Path) -> Section:
+    """The file's outermost mapping; keys that it does not have are those of the file that it is ``like``."""
+    root = read_section(path)
+    if "like" not in root.values:
+        return root
+    other = _whole(_located(root, "like"))
+    del root.values["like"]
+    return replace(root, values=other.values | root.values, lines=other.lines | root.lines)
 
 
 # --- The model --------------------------------------------------------------------------------------------------
