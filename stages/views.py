@@ -83,6 +83,8 @@ TABLE_SIZE = (0.7, 1.1)
 NODE_SPACING = (130.0, 110.0)
 """Pixels between the nodes of a scene graph, across and down."""
 GHOST_TRIANGLES = 80
+_NO_ROBOTS_TABLE = (0.8, 0.0, 0.7)
+"""Where the middle of the table is taken to be in graphs that name no robot, metres."""
 UNSURE = 0.5
 """Probability below which an object is drawn in red."""
 _GREY: Color = (128, 128, 128)
@@ -110,6 +112,9 @@ class Views:
         self._posteriors: deque[Posterior] = deque(maxlen=512)
         robots = [Path(config["robot"]) for config in configs.values() if "robot" in config]
         self._robot_file = robots[0] if robots else ROBOT
+        # Graphs without a robot need not have one installed.
+        table = read_robot(self._robot_file).table if robots else None
+        self._table = (*table.center, table.height) if table else _NO_ROBOTS_TABLE
         self._joints: dict[str, float] = {}
         self._renderers: dict[tuple[int, int], Renderer] = {}
         self._shown: dict[str, str] = {}
@@ -132,7 +137,16 @@ class Views:
             )
         )
         world = Column(
-            (Panel("World", "space", "world", eye=(1.6, -0.9, 1.45), target=(0.55, 0.03, 0.85)), filters),
+            (
+                Panel(
+                    "World",
+                    "space",
+                    "world",
+                    eye=self._from_table(0.8, -0.9, 0.75),
+                    target=self._from_table(-0.25, 0.03, 0.15),
+                ),
+                filters,
+            ),
             shares=(3, 1.2),
         )
         knowledge = Column(
@@ -144,6 +158,11 @@ class Views:
             shares=(1.2, 1.2, 1),
         )
         return Row((images, world, knowledge), shares=(1, 1.7, 1.1))
+
+    def _from_table(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """A point seen from the middle of the table, in the base frame."""
+        cx, cy, cz = self._table
+        return cx + x, cy + y, cz + z
 
     def static(self) -> Iterable[Drawing]:
         """Nothing: even the robot is only there once it speaks."""
@@ -258,7 +277,6 @@ class Views:
 
     @cached_property
     def _body(self) -> Body:
-        # Graphs without a robot need not have one installed.
         return read_robot(self._robot_file).body
 
     def _robot(self, names: Sequence[str], positions: Floats) -> Iterator[Drawing]:
