@@ -20,6 +20,7 @@ from runner.process.children import ENVIRONMENT
 
 TITLES = {
     "digest": "DIGEST",
+    "depth": "DIGEST without colour",
     "paper": "DIGEST as in the paper",
     "icp": "multi-start ICP",
     "fpfh": "FPFH + RANSAC + ICP",
@@ -27,15 +28,16 @@ TITLES = {
     "perch": "PERCH-style search",
     "random": "random guess",
 }
+_DIGEST: dict[str, list[str]] = {"digest": [], "depth": ["--without", "colour"], "paper": ["--form", "paper"]}
+"""Options of the estimator by method."""
 
 
 def command(method: str, options: argparse.Namespace, out: Path) -> list[str]:
     """What runs one method; DIGEST as its graph would, its replicas dividing the hypotheses of each image."""
     run = [sys.executable, "-m"]
-    if method in ("digest", "paper"):
-        form = "default" if method == "digest" else "paper"
-        share = ["--form", form, "--share", "hypotheses", "--processes", str(options.processes)]
-        run += ["benchmarks.estimate", str(options.dataset), options.detections, str(out), *share]
+    if method in _DIGEST:
+        share = ["--share", "hypotheses", "--processes", str(options.processes)]
+        run += ["benchmarks.estimate", str(options.dataset), options.detections, str(out), *_DIGEST[method], *share]
     else:
         run += ["benchmarks.baselines", method, str(options.dataset), options.detections, str(out)]
     images_wanted = ["--images", options.images] if options.images else []
