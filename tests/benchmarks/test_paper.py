@@ -8,6 +8,7 @@ from benchmarks.episodes import Episode
 from benchmarks.paper.__main__ import EXPERIMENTS, Experiment, failures, table
 from runner.graph.graph import load_graph
 from stages.devices.suites.tray import GOALS
+from stages.messages import Assertion
 from stages.scene.truth import Judgement
 
 
@@ -24,7 +25,7 @@ def test_the_proof_of_concept_has_no_digest() -> None:
 
 
 def episode(*, restored: bool, claimed: bool) -> Episode:
-    judgement = Judgement(claimed=claimed, held=("on(cup, tray)",) if restored else ())
+    judgement = Judgement(claimed=claimed, held=(Assertion(predicate="exist", arguments=("cup",)),) if restored else ())
     return Episode(0, int(not claimed), 20.0, None, judgement, (), True, "not seen: cup", Path("a.mcap"))
 
 
