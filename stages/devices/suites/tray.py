@@ -1,4 +1,4 @@
-"""The suite ``tray``: four goals written by hand, five objects on and around a tray, upright and apart."""
+"""The suite ``tray``: five goals written by hand, five objects on and around a tray, upright and apart."""
 
 from __future__ import annotations
 
@@ -74,8 +74,17 @@ GOALS: dict[str, tuple[Spot, ...]] = {
         Spot("salt_shaker", "tea_box"),
         Spot("tuna_can", TRAY, x=0.120),
     ),
+    "supper": (
+        Spot("cup", TRAY, x=-0.120),
+        Spot("salt_shaker", TRAY, x=0.0),
+        Spot("tuna_can", TRAY, x=0.110),
+        Spot("sugar_box", "table"),
+        Spot("water_bottle", "table", y=0.105, beside="sugar_box"),
+    ),
 }
 """Goal scenes by name. Neighbours stand 3 cm apart, in line with neither's fingers."""
+_BY_SEED = ("tea", "breakfast", "lunch", "snack")
+"""Those that ``auto`` chooses from: a seed keeps its world."""
 
 
 def goal_name(goal: str, seed: int) -> str:
@@ -85,7 +94,7 @@ def goal_name(goal: str, seed: int) -> str:
         Refused: no such template.
     """
     if goal == "auto":
-        return tuple(GOALS)[seed % len(GOALS)]
+        return _BY_SEED[seed % len(_BY_SEED)]
     if goal not in GOALS:
         raise Refused(f"world.goal: no goal scene {goal!r}; choose auto or one of {', '.join(GOALS)}")
     return goal
