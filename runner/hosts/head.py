@@ -45,7 +45,7 @@ from runner.recording.provenance import (
 )
 from runner.terminal import listed
 from runner.transport.bus import Bus
-from runner.transport.session import Router, private
+from runner.transport.session import open_session, private
 
 ABSENT_SECONDS = 60.0
 """How long a host that is cut off may stay away while a stage has no other process."""
@@ -190,7 +190,8 @@ class Hosts:
         self._present: set[Process] = set()
         self._changed = threading.Condition(threading.RLock())
         self._remind_at = time.monotonic()
-        self._router = Router(self.endpoint, network) if layout.router_is_head else None
+        self._router = open_session([self.endpoint], [], network, mode="router") if layout.router_is_head else None
+        """Forwards between the sessions of a routed network, which do not link to each other."""
         own = Process(network.head, 0, secrets.randbits(24))
         self._bus = Bus(control(name), self.endpoint, network=network, process=own, listen=not network.routed)
 

@@ -23,13 +23,18 @@ class Refusals:
         self._show = show
         self._counting = threading.Lock()
 
-    def read(self, kind: type[R], packet: Packet) -> R | None:
-        """The record that has been sent, or None: then it is refused."""
-        try:
-            return codec.unpack(kind, packet.payload)
-        except CodecError as error:
-            self.refuse(packet.key, error)
-            return None
+    def reading(self, kind: type[R], note: Callable[[R, Packet], None]) -> Callable[[Packet], None]:
+        """Takes packets and has every record noted; what is not of its kind is refused."""
+
+        def take(packet: Packet) -> None:
+            try:
+                record = codec.unpack(kind, packet.payload)
+            except CodecError as error:
+                self.refuse(packet.key, error)
+            else:
+                note(record, packet)
+
+        return take
 
     def refuse(self, key: str, error: Exception) -> None:
         """Counts a message and shows what is wrong with it; of very many only some."""

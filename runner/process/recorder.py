@@ -77,11 +77,12 @@ class Recorder:
         """Their links have closed: all that they have sent has come."""
         self._lost: dict[Process, float] = {}
         """By the supervisor's word: when it is taken that all has come of those that were never seen; 0 once it has."""
-        self._takers = {
-            "m": self._on_message,
-            "s": self._on_step,
-            "l": self._on_log,
-            "x": self._on_lost,
+        reading = self._refusals.reading
+        self._takers: dict[str, Callable[[Packet], None]] = {
+            "m": reading(Envelope, self._on_message),
+            "s": reading(Step, self._on_step),
+            "l": reading(LogLine, lambda line, packet: self._writer.put(line, packet.payload)),
+            "x": reading(Lost, self._on_lost),
             "knows": self._on_knows,
         }
         """By the first part of a key."""
@@ -151,8 +152,7 @@ class Recorder:
             gone = [process for process in self._lost if self._has_all_of(process)]
         heard = [list(channel.take()) for channel in list(self._channels.values())]
         for packet in itertools.chain(*reversed(heard)):
-            kind, _, rest = packet.key.partition("/")
-            self._takers[kind](rest, packet)
+            self._takers[packet.key.partition("/")[0]](packet)
         for process in gone:
             self._settle(process)
         with self._changing:
@@ -184,44 +184,32 @@ class Recorder:
         self._redelivery.catch_up(process)
         self._say(f"ready/{process.path}", b"")
 
-    def _on_message(self, topic: str, packet: Packet) -> None:
-        envelope = self._refusals.read(Envelope, packet)
-        if envelope is None:
-            return
+    def _on_message(self, envelope: Envelope, packet: Packet) -> None:
+        topic = packet.key.partition("/")[2]
         if not self._manifest.steps_only:
             self._writer.put(envelope, packet.payload)
         for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
             self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
 
-    def _on_step(self, stage: str, packet: Packet) -> None:
+    def _on_step(self, step: Step, packet: Packet) -> None:
         """Refuses what a process says that is dead: the others know it as lost, and do its work again."""
-        step = self._refusals.read(Step, packet)
-        if step is None:
-            return
-        if step.stage != stage:
-            wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
+        if step.stage != packet.end:
+            wrong = CodecError("Step", "stage", f"expected {packet.end}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
         elif self._lost.get(step.process) != 0:
             self._writer.put(step, packet.payload)
             self._redelivery.note_step(step)
             self._to_say.append(step)
 
-    def _on_log(self, _: str, packet: Packet) -> None:
-        line = self._refusals.read(LogLine, packet)
-        if line is not None:
-            self._writer.put(line, packet.payload)
+    def _on_lost(self, lost: Lost, packet: Packet) -> None:
+        self._writer.put(lost, packet.payload)
+        with self._changing:
+            self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
 
-    def _on_lost(self, _: str, packet: Packet) -> None:
-        lost = self._refusals.read(Lost, packet)
-        if lost is not None:
-            self._writer.put(lost, packet.payload)
-            with self._changing:
-                self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
-
-    def _on_knows(self, path: str, packet: Packet) -> None:
+    def _on_knows(self, packet: Packet) -> None:
         """A publisher sends to a successor from now on; what it has sent before is here."""
         try:
-            publisher, process = Process.of(packet.payload.decode()), Process.of(path)
+            publisher, process = Process.of(packet.payload.decode()), Process.of(packet.key)
         except (Refused, UnicodeDecodeError) as error:
             self._refusals.refuse(packet.key, error)
             return

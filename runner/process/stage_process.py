@@ -167,15 +167,15 @@ class StageProcess:
         """Subscribes to everything first and announces this process last: who sees it may send."""
         own = f"{self._process.stage}/{self._process.replica}"
         for consumer in {self._process.stage, *(route.consumer for route in self._task.routes)}:
-            self._bus.subscribe(f"j/{consumer}", self._on_journal)
+            self._bus.subscribe(f"j/{consumer}", self._refusals.reading(Journal, self._on_journal))
         for port, edge in self._node.inputs.items():
             listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
             listen(f"m/{edge.stage}/{edge.port}", partial(self._on_message, port))
         self._bus.hand_over(f"again/{own}/*", lambda packet: self._arrive(packet.end, packet))
         self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._on_ready())
-        self._bus.hand_over(f"d/{own}/*", self._on_deal)
+        self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._on_deal))
         self._bus.hand_over("e/**", self._on_end)
-        self._bus.subscribe("x/*", self._on_lost)
+        self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
         self._heart.start()
         self._bus.announce()
@@ -207,11 +207,9 @@ class StageProcess:
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
 
-    def _on_lost(self, packet: Packet) -> None:
-        lost = self._refusals.read(Lost, packet)
-        if lost is not None:
-            self._presence.ended(lost.process)
-            self._delivery.lost(lost.process)
+    def _on_lost(self, lost: Lost, _: Packet) -> None:
+        self._presence.ended(lost.process)
+        self._delivery.lost(lost.process)
 
     def _on_end(self, packet: Packet) -> None:
         try:
@@ -219,11 +217,9 @@ class StageProcess:
         except Refused as refusal:
             self._refusals.refuse(packet.key, refusal)
 
-    def _on_journal(self, packet: Packet) -> None:
+    def _on_journal(self, journal: Journal, packet: Packet) -> None:
         """What a step has done with is acknowledged by it, once the recorder has the step."""
-        journal, consumer = self._refusals.read(Journal, packet), packet.end
-        if journal is None:
-            return
+        consumer = packet.end
         for done in (journal.answered, *map(answered, journal.steps)):
             self._delivery.answered(consumer, done)
             if consumer == self._process.stage:
@@ -259,9 +255,8 @@ class StageProcess:
                 return
         self._mailbox.put(port, packet)
 
-    def _on_deal(self, packet: Packet) -> None:
-        deal = self._refusals.read(Deal, packet)
-        if deal is not None and (part := self._parts.deal(packet.end, deal.id)) is not None:
+    def _on_deal(self, deal: Deal, packet: Packet) -> None:
+        if (part := self._parts.deal(packet.end, deal.id)) is not None:
             self._mailbox.put(packet.end, part)
 
     def _take(self, name: str, packet: Packet) -> None:

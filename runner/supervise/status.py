@@ -57,15 +57,10 @@ class TopicStatus(msgspec.Struct, frozen=True):
 
 
 class RunStatus(msgspec.Struct, frozen=True):
-    """A whole run."""
+    """A whole run, beyond its :class:`runner.supervise.registry.Entry`."""
 
-    run: str
-    graph: str
-    """Path of the graph file."""
-    recording: str
     endpoint: str
-    started: float
-    """Seconds since the epoch."""
+    """Where others may listen to it."""
     ready: bool
     """Whether every process has been ready at least once, and the recorder is."""
     processes: tuple[ProcessStatus, ...]

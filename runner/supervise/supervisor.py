@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 
@@ -39,7 +38,6 @@ from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import Gateway, new_endpoint, remove_sockets
 
-R = TypeVar("R", bound=msgspec.Struct)
 EXIT_INCOMPLETE = 3
 
 
@@ -70,7 +68,7 @@ class Supervisor:
         gateway = new_endpoint(endpoint if network is None else "")
         with naming():
             id, recording = _new_recording(recordings, graph.name)
-            self._entry = Entry(
+            entry = Entry(
                 run=id,
                 gateway=gateway,
                 pid=os.getpid(),
@@ -78,7 +76,7 @@ class Supervisor:
                 recording=str(recording.absolute()),
                 started=time.time(),
             )
-            self._registration = Registration(self._entry)
+            self._registration = Registration(entry)
         self._run = run = Run(id, graph, recording, settings, endpoint, gateway, network, steps_only)
         self._own = Process(SUPERVISOR, 0)
         self._bus = Bus(id, endpoint, network=network, process=self._own, listen=network is None)
@@ -148,25 +146,18 @@ class Supervisor:
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _connect(self) -> None:
-        self._hear("j/*", Journal, self._on_journal)
-        self._hear("l/*", LogLine, self._on_log)
-        self._hear("h/**", Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns))
-        self._hear(f"m/*/{FINISHED}", Envelope, self._on_finished)
+        hear, reading = self._bus.subscribe, self._refusals.reading
+        hear("j/*", reading(Journal, self._on_journal))
+        hear("l/*", reading(LogLine, self._on_log))
+        hear("h/**", reading(Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns)))
+        hear(f"m/*/{FINISHED}", reading(Envelope, self._on_finished))
+        note_answer = reading(Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
         for key in self._calls.answer_keys:
-            self._hear(f"m/{key}", Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
-        self._bus.subscribe("settled/**", partial(self._on_word, self._guardian.settled))
-        self._bus.subscribe("e/**", partial(self._on_word, self._guardian.quiet))
+            hear(f"m/{key}", note_answer)
+        hear("settled/**", partial(self._on_word, self._guardian.settled))
+        hear("e/**", partial(self._on_word, self._guardian.quiet))
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
-
-    def _hear(self, path: str, kind: type[R], note: Callable[[R, Packet], None]) -> None:
-        """Has everything noted that is sent to a path; what is not of its kind is refused."""
-
-        def take(packet: Packet) -> None:
-            if (record := self._refusals.read(kind, packet)) is not None:
-                note(record, packet)
-
-        self._bus.subscribe(path, take)
 
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
         self._delivery.answered(packet.end, journal.answered)
@@ -292,11 +283,7 @@ class Supervisor:
 
     def _status(self) -> RunStatus:
         return RunStatus(
-            run=self._run.id,
-            graph=self._entry.graph,
-            recording=self._entry.recording,
             endpoint=self._graph.listen or self._run.gateway,
-            started=self._entry.started,
             ready=not self._guardian.awaited(),
             processes=self._guardian.status(),
             topics=topics_of(self._graph),

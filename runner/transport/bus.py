@@ -128,10 +128,7 @@ class Bus:
         self._declare(self._listener or self._session, path, self._taker(take))
 
     def _taker(self, take: Callable[[Packet], None]) -> Callback[zenoh.Sample]:
-        def receive(sample: zenoh.Sample) -> None:
-            take(self._packet(sample))
-
-        return Callback(receive, indirect=False)
+        return Callback(lambda sample: take(self._packet(sample)), indirect=False)
 
     def channel(self, path: str) -> Channel:
         """Everything sent to ``path`` by others, to be taken when the time has come: cheaper than calls one by one."""

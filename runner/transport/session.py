@@ -104,18 +104,6 @@ def _let_go(link: socket.socket) -> None:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
 
 
-class Router:
-    """Where the sessions of a routed network meet: it forwards between those that do not link to each other."""
-
-    def __init__(self, endpoint: str, network: Network):
-        """Raises Refused where this machine cannot listen there."""
-        self._session = open_session([endpoint], [], network, mode="router")
-
-    def close(self) -> None:
-        """Lets everybody go."""
-        self._session.close()
-
-
 class Gateway:
     """Where tools and strangers listen to a run, as clients.
 

@@ -87,7 +87,7 @@ def _ps(options: argparse.Namespace) -> None:
     for number, entry in enumerate(entries):
         try:
             with Live(entry) as live:
-                text = status_text(live.status())
+                text = status_text(entry, live.status())
         except Refused as refusal:  # it has just ended, or it hangs
             text = str(refusal)
         print("\n" * (number > 0) + text)
