@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 import msgspec
 from mcap.records import Metadata
 
-from runner.contract import Refused
-from runner.graph.graph import SUPERVISOR
-from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
-from runner.message.ids import IdText
+from runner.contract import Message, Refused
+from runner.graph.graph import SUPERVISOR, Graph
+from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open_envelope, unpack
+from runner.message.ids import IdText, MessageId
 from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
@@ -94,6 +94,21 @@ class Verdict:
 def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     """The stages of a graph, as recorded, that run as replicas."""
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
+
+
+def kind_of(graph: Graph, id: str) -> type[Message] | None:
+    """The class of a message; None where the graph has no such output."""
+    one = MessageId.of(id)
+    return graph.outputs_of(one.stage).get(one.port)
+
+
+def opened(graph: Graph, sealed: Envelope) -> Message | None:
+    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
+    kind = kind_of(graph, sealed.id)
+    try:
+        return open_envelope(kind, sealed) if kind else None
+    except CodecError as error:
+        raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
 def _decoded(text: str, kind: type[T]) -> T:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Message, Refused, Tolerances
-from runner.graph.graph import SUPERVISOR, Graph, Node
+from runner.contract import Tolerances
+from runner.graph.graph import Node
 from runner.graph.ports import Handler
 from runner.inspect.compare import envelope_differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
+from runner.message.codec import CodecError, Envelope, Step, pack
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
@@ -243,19 +243,3 @@ def what_differs(recorded: Envelope, replayed: Envelope) -> Envelope | None:
         return None
     replayed = without_gained_fields(recorded, replayed)
     return None if pack(recorded) == pack(replayed) else replayed
-
-
-def kind_of(graph: Graph, id: str) -> type[Message] | None:
-    """The class of a message; None where the graph has no such output."""
-    one = MessageId.of(id)
-    known = one.stage in graph.nodes or one.stage == SUPERVISOR
-    return graph.outputs_of(one.stage).get(one.port) if known else None
-
-
-def opened(graph: Graph, sealed: Envelope) -> Message | None:
-    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
-    kind = kind_of(graph, sealed.id)
-    try:
-        return open_envelope(kind, sealed) if kind else None
-    except CodecError as error:
-        raise Refused(f"{sealed.id} cannot be read: {error}") from None

@@ -26,20 +26,10 @@ from runner.inspect.info import table
 from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, arguments_of
-from runner.recording.recording import Recording, replicated
+from runner.recording.recording import Recording, kind_of, opened, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
-from runner.replay.tasks import (
-    HEADER,
-    Execution,
-    Reexecution,
-    Task,
-    kind_of,
-    opened,
-    process_of,
-    steps_of,
-    what_differs,
-)
+from runner.replay.tasks import HEADER, Execution, Reexecution, Task, process_of, steps_of, what_differs
 
 SHOWN = 76
 """Characters of a value that are shown."""

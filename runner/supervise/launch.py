@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.graph.graph import Graph, graph_to_json, node_entry
 from runner.graph.placement import Network
 from runner.hosts.head import Hosts
 from runner.message.packet import Process
@@ -69,11 +69,7 @@ class Launcher:
     def recorder(self, process: Process) -> Child:
         """Starts what writes the recording."""
         run = self._run
-        topics = {
-            f"{stage}/{port}": topic(kind)
-            for stage in (*run.graph.nodes, SUPERVISOR)
-            for port, kind in run.graph.outputs_of(stage).items()
-        }
+        topics = {name: topic(kind) for name, kind in run.graph.topics().items()}
         task = Manifest(
             run.id,
             run.endpoint,

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from runner.graph.graph import SUPERVISOR, Graph
+from runner.graph.graph import Graph
 from runner.message.codec import Pulse
 from runner.message.packet import Process
 
@@ -113,12 +113,8 @@ def _flow(before: tuple[int, int], now: tuple[int, int], seconds: float) -> Flow
 
 def topics_of(graph: Graph) -> tuple[TopicStatus, ...]:
     """Every output port of a graph, the supervisor's last."""
+    goes_to = graph.destinations()
     return tuple(
-        TopicStatus(f"{stage}/{port}", kind.__name__, _consumers(graph, stage, port))
-        for stage in (*graph.nodes, SUPERVISOR)
-        for port, kind in graph.outputs_of(stage).items()
+        TopicStatus(topic, kind.__name__, tuple(f"{route.consumer}.{route.input}" for route in goes_to.get(topic, ())))
+        for topic, kind in graph.topics().items()
     )
-
-
-def _consumers(graph: Graph, stage: str, port: str) -> tuple[str, ...]:
-    return tuple(f"{route.consumer}.{route.input}" for route in graph.routes(stage) if route.output == port)

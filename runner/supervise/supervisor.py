@@ -67,9 +67,9 @@ class Supervisor:
         endpoint, network = (self._hosts.endpoint, self._hosts.network) if self._hosts else (new_endpoint(), None)
         gateway = new_endpoint(endpoint if network is None else "")
         with naming():
-            id, recording = _new_recording(recordings, graph.name)
+            self.id, recording = _new_recording(recordings, graph.name)
             entry = Entry(
-                run=id,
+                run=self.id,
                 gateway=gateway,
                 pid=os.getpid(),
                 graph=str(file.absolute()),
@@ -77,11 +77,11 @@ class Supervisor:
                 started=time.time(),
             )
             self._registration = Registration(entry)
-        self._run = run = Run(id, graph, recording, settings, endpoint, gateway, network, steps_only)
+        self._run = run = Run(self.id, graph, recording, settings, endpoint, gateway, network, steps_only)
         self._own = Process(SUPERVISOR, 0)
-        self._bus = Bus(id, endpoint, network=network, process=self._own, listen=network is None)
+        self._bus = Bus(self.id, endpoint, network=network, process=self._own, listen=network is None)
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
-        self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
+        self._gateway.announce(f"{self.id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
         warn = partial(self._say, level="warning")
         stopping = self._stopping.is_set
@@ -107,23 +107,18 @@ class Supervisor:
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
 
-    @property
-    def id(self) -> str:
-        """Of the run."""
-        return self._run.id
-
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
         self._connect()
-        where = f"run {self._run.id} on {self._graph.listen or self._run.gateway}"
+        where = f"run {self.id} on {self._graph.listen or self._run.gateway}"
         self._terminal.show(SUPERVISOR, f"{where} starts {len(self._graph.processes())} processes")
         try:
             self._guardian.start_recorder(view=view)
             if self._hosts is not None:
-                self._hosts.open(self._run.id, self._run.recording)
+                self._hosts.open(self.id, self._run.recording)
             self._guardian.start_stages()
             end = self._watch()
         finally:

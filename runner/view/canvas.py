@@ -32,15 +32,12 @@ class Canvas:
         fresh = True
         for drawing in drawings:
             if fresh or isinstance(drawing, d.NextStep):
-                self._advance(time_ns)
+                self._step += 1
+                self._stream.set_time(STEP, sequence=self._step)
+                self._stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
                 fresh = False
             if not isinstance(drawing, d.NextStep):
                 self._put(drawing)
-
-    def _advance(self, time_ns: int) -> None:
-        self._step += 1
-        self._stream.set_time(STEP, sequence=self._step)
-        self._stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
         found = _ARCHETYPES[type(drawing)](drawing)

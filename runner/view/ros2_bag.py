@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from runner.contract import Message, Refused
 from runner.graph.graph import Graph, graph_from_json
-from runner.message.codec import open_envelope
-from runner.message.ids import MessageId
-from runner.recording.recording import Recording
+from runner.recording.recording import Recording, opened
 from runner.view.views import load_views
 
 if TYPE_CHECKING:
@@ -96,8 +94,6 @@ def _write(folder: Path, messages: Iterable[tuple[int, BagMessage]]) -> Counter[
 def _said(recording: Recording, graph: Graph, views: Ros2Views) -> Iterator[tuple[int, BagMessage]]:
     """In the order of recording, with the times of it."""
     for id, message in recording.messages.items():
-        name = MessageId.of(id)
-        kind = graph.outputs_of(name.stage).get(name.port)
-        if kind is not None:
-            for one in views.ros2(open_envelope(kind, recording.envelope(id)), message.log_time_ns):
+        if (content := opened(graph, recording.envelope(id))) is not None:
+            for one in views.ros2(content, message.log_time_ns):
                 yield message.log_time_ns, one
