@@ -17,7 +17,7 @@ from msgspec import Meta
 from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.packaged import locate
-from runner.graph.placement import ALONE, Layout, check_listen, read_layout, read_placement
+from runner.graph.placement import ALONE, Layout, check_listen, read_layout
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_shared
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
@@ -531,7 +531,11 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
 
 def _placement(document: Document, name: str, entry: StageEntry) -> tuple[str, ...]:
     """The host of each replica, which a count by host or ``replicas`` says, and where both do they agree."""
-    counts = read_placement(document, name, entry.host)
+    counts = {entry.host: 1} if isinstance(entry.host, str) else entry.host or {}
+    hosts = document.values.get("hosts") or {}
+    for host in counts:
+        if host not in hosts:
+            raise Refused(f"{document.place('stages', name, 'host')}: no host {host!r}{suggest(host, hosts)}")
     stated = "replicas" in document.values["stages"][name]
     if counts and stated and entry.replicas == "auto":
         place = document.place("stages", name, "replicas")

@@ -264,16 +264,6 @@ def check_listen(document: Document, layout: Layout) -> None:
         )
 
 
-def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:
-    """Replicas by host from ``host: NAME`` or ``host: {NAME: REPLICAS}``; empty where none is named."""
-    counts = {value: 1} if isinstance(value, str) else value or {}
-    names = _entries(document)
-    for name in counts:
-        if name not in names:
-            raise Refused(f"{document.place('stages', stage, 'host')}: no host {name!r}{suggest(name, names)}")
-    return counts
-
-
 def choose_host(layout: Layout, name: str | None, file: Path) -> str | None:
     """The host whose processes this machine starts; None where the graph names none. Raises Refused with the names."""
     if not layout.hosts:

@@ -30,7 +30,7 @@ from runner.hosts.head import (
     introduce,
     network_of,
 )
-from runner.message.packet import Packet, Process
+from runner.message.packet import Process
 from runner.process.children import Family, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
@@ -91,7 +91,8 @@ class Agent:
 
     def _take_part(self) -> Dismiss:
         """Raises Refused with the head's reason where it does not take this host in."""
-        self._bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)
+        path = f"order/{self._host}/{self._session}"
+        self._bus.subscribe(path, lambda packet: self._events.put(msgspec.json.decode(packet.payload, type=Order)))
         self._bus.watch(self._on_presence)
         self._bus.announce()
         while not self._head_is_there:
@@ -105,9 +106,6 @@ class Agent:
         self._folder = (self._recordings / run).absolute()
         (self._folder / "log").mkdir(parents=True, exist_ok=True)
         return self._serve()
-
-    def _on_order(self, packet: Packet) -> None:
-        self._events.put(msgspec.json.decode(packet.payload, type=Order))
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if process.stage == self._network.head:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import cast
 
 import msgspec
 
@@ -26,7 +26,7 @@ from runner.process.health import Heart
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
 from runner.recording.writer import Manifest, RecordingWriter
-from runner.transport.bus import Bus, Channel
+from runner.transport.bus import Bus
 from runner.transport.presence import Presence
 
 TICK_SECONDS = 0.25
@@ -67,7 +67,7 @@ class Recorder:
         self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
         self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
         self._ended = threading.Event()
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, Callable[[], Iterator[Packet]]] = {}
         """By what is heard; each is taken before those that come before it on a link, and worked on after them."""
         self._changing = threading.Lock()
         self._presence = Presence()
@@ -86,7 +86,7 @@ class Recorder:
             "knows": self._on_knows,
         }
         """By the first part of a key."""
-        self._heart = Heart(own, self._bus, self._vitals)
+        self._heart = Heart(own, self._bus, lambda: {**self._writer.vitals(), "refused": self._refusals.count})
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
@@ -95,7 +95,7 @@ class Recorder:
         self._speaker.start()
         self._taker.start()
         self._heart.start()
-        if self._presence.wait_for(self._manifest.processes, self._must_end):
+        if self._presence.wait_for(self._manifest.processes, lambda: is_orphan() or not self._ends.empty()):
             # Zenoh sends to subscribers in the order in which they came: whoever works on a message has it first.
             self._hear(*sorted({f"m/{topic.partition('/')[0]}/*" for topic in self._manifest.topics}))
             self._bus.announce()
@@ -117,9 +117,6 @@ class Recorder:
         signal handler."""
         self._ends.put(orphaned)
 
-    def _must_end(self) -> bool:
-        return is_orphan() or not self._ends.empty()
-
     def _wait_for_the_end(self) -> bool:
         """Returns whether the supervisor has died. A signal may reach another thread: an endless wait would miss it."""
         while not is_orphan():
@@ -135,9 +132,6 @@ class Recorder:
             time.sleep(TICK_SECONDS / 5)
         self._writer.note_problem("the supervisor died")
 
-    def _vitals(self) -> dict[str, Any]:
-        return {**self._writer.vitals(), "refused": self._refusals.count}
-
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _take_all(self) -> None:
@@ -150,7 +144,7 @@ class Recorder:
         """Takes what is there; what a process has sent that was seen to go is among it."""
         with self._changing:
             gone = [process for process in self._lost if self._has_all_of(process)]
-        heard = [list(channel.take()) for channel in list(self._channels.values())]
+        heard = [list(take()) for take in list(self._channels.values())]
         for packet in itertools.chain(*reversed(heard)):
             self._takers[packet.key.partition("/")[0]](packet)
         for process in gone:

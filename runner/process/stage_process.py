@@ -95,7 +95,7 @@ class StageProcess:
             task.stage,
             task.routes,
             self._bus.publish,
-            self._warn,
+            partial(self._log, level="warning"),
             stopping=self._stopping.is_set,
             undone=task.undone,
         )
@@ -113,7 +113,7 @@ class StageProcess:
         self._arrived.update(dict.fromkeys(one for one in task.consumed if not self._node.keeps(one[0])))
         self._left: list[tuple[str, str]] = []
         """(port, id) of what was refused since the last step."""
-        self._refusals = Refusals(lambda text: self._log(text, "error"))
+        self._refusals = Refusals(partial(self._log, level="error"))
         self._mailbox = Mailbox(self._node)
         self._catching_up = threading.Lock()
         self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
@@ -183,11 +183,8 @@ class StageProcess:
     def _vitals(self) -> dict[str, Any]:
         """What the pulse says beyond what holds for any process. Runs on the pulse's thread and waits for nobody."""
         record, queued = self._present, self._inbox.waiting
-        working = record is not None and record.computing
         return {
-            "state": "waiting" if record is None else "working" if working else "held back",
-            "handler": "" if record is None else record.handler,
-            "busy_ns": 0 if record is None else record.busy_ns,
+            **(record.vitals() if record is not None else {}),
             "steps": self._steps,
             "refused": self._refusals.count,
             "queued": {port: waiting + self._mailbox.waiting(port) for port, waiting in queued.items()},
@@ -390,9 +387,6 @@ class StageProcess:
     def _skipped(self) -> dict[str, int]:
         return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
 
-    def _warn(self, text: str) -> None:
-        self._log(text, "warning")
-
     def _log(self, text: str, level: Level) -> None:
         line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
         self._bus.publish(f"l/{self._process.stage}", codec.pack(line))
@@ -414,21 +408,14 @@ class _Record:
         self.outcome: Outcome = "done"
         self.error = ""
 
-    @property
-    def handler(self) -> str:
-        """What runs."""
-        return self._ready.handler.name
-
-    @property
-    def computing(self) -> bool:
-        """Whether the handler runs, rather than what it emitted being sent."""
-        return self._begun_ns > 0
-
-    @property
-    def busy_ns(self) -> int:
-        """Time inside the handler so far. May be read from any thread."""
-        begun = self._begun_ns
-        return self._computed_ns + (time.monotonic_ns() - begun if begun else 0)
+    def vitals(self) -> dict[str, Any]:
+        """What the pulse says of it. May be asked from any thread."""
+        computed, begun = self._computed_ns, self._begun_ns
+        return {
+            "state": "working" if begun else "held back",
+            "handler": self._ready.handler.name,
+            "busy_ns": computed + (time.monotonic_ns() - begun if begun else 0),
+        }
 
     def timed(self, emissions: Iterator[Draft | None]) -> Iterator[Draft]:
         """Passes emissions on up to a None, noting their ids and the time the handler took for them."""
@@ -440,7 +427,8 @@ class _Record:
                 self.ended = True
                 return
             finally:
-                self._computed_ns, self._begun_ns = self.busy_ns, 0
+                begun, self._begun_ns = self._begun_ns, 0
+                self._computed_ns += time.monotonic_ns() - begun
             if draft is None:
                 return
             self.emitted.append(draft.envelope.id)
@@ -489,7 +477,7 @@ def main() -> int:
     sys.setswitchinterval(SWITCH_SECONDS)
     for signum in (signal.SIGINT, signal.SIGHUP):
         signal.signal(signum, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # there is nothing to finish before the stage is there
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
     try:
         process = StageProcess(assignment)
@@ -514,11 +502,6 @@ def _serve(process: StageProcess) -> int:
         code = _fail(_summary(error), EXIT_FAILED)
     process.close(failed=code != 0)
     return code
-
-
-def _leave(*_: object) -> None:
-    """Before the stage is there, there is nothing to finish."""
-    os._exit(0)
 
 
 def _fail(reason: str, code: int) -> int:

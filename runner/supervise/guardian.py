@@ -252,17 +252,22 @@ class Guardian:
         return tuple(map(self._status_of, filter(None, (self._recorder, *self._children.values()))))
 
     def _status_of(self, child: Child) -> ProcessStatus:
-        process = child.process
-        state = self.pulses.state(process) if process in self._ready else "starting"
+        process, pulse = child.process, self.pulses.newest(child.process)
+        if child.handle.poll() is not None:
+            state = "ended"
+        elif pulse is None or process not in self._ready:
+            state = "starting"
+        else:
+            state = "silent" if child.watch.slow else pulse.state
         return ProcessStatus(
             stage=process.stage,
             replica=process.replica,
             name=self._run.name_of(process),
-            state=state if child.handle.poll() is None else "ended",
+            state=state,
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
-            pulse=self.pulses.newest(process),
+            pulse=pulse,
             **self.pulses.rates(process),
         )
 

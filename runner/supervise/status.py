@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict, deque
 from typing import Any
 
@@ -12,7 +11,6 @@ from runner.graph.graph import Graph
 from runner.message.codec import Pulse
 from runner.message.packet import Process
 
-SILENT_NS = 3_000_000_000
 WINDOW = 7
 """Pulses over which rates are taken: three seconds."""
 
@@ -33,7 +31,7 @@ class ProcessStatus(msgspec.Struct, frozen=True):
     name: str
     """As log lines call it: with the replica's number where there are several."""
     state: str
-    """``starting``, what its newest pulse says, ``silent`` where that is old, or ``ended``."""
+    """``starting``, what its newest pulse says, ``silent`` while none comes, or ``ended``."""
     pid: int
     restarts: int
     reason: str = ""
@@ -84,14 +82,6 @@ class Pulses:
         """The newest of a process, if any has come."""
         window = self._pulses.get(process)
         return window[-1][1] if window else None
-
-    def state(self, process: Process) -> str:
-        """What the newest pulse of a process says, ``silent`` where it is old, ``starting`` where there is none."""
-        window = self._pulses.get(process)
-        if not window:
-            return "starting"
-        arrived_ns, newest = window[-1]
-        return newest.state if time.monotonic_ns() - arrived_ns < SILENT_NS else "silent"
 
     def rates(self, process: Process) -> dict[str, Any]:
         """What of a :class:`ProcessStatus` is a rate."""

@@ -23,7 +23,7 @@ from runner.contract import Refused
 from runner.graph.graph import graph_from_json
 from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
-from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
+from runner.recording.container import Container, Entry, Growing, is_being_written, open_file, recordings_in
 from runner.recording.recording import RUN, Recording, payload_kind
 from runner.terminal import has_display
 from runner.view.canvas import Canvas
@@ -103,7 +103,7 @@ def view_live(path: Path | None = None) -> None:
 
 def newest_live(folder: Path) -> Path:
     """The newest recording that a running graph writes; raises Refused where there is none."""
-    for path in sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True):
+    for path in recordings_in(folder):
         with path.open("rb") as file:
             if is_being_written(file):
                 return path

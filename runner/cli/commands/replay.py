@@ -1,7 +1,6 @@
 """Commands that execute a recording again: ``replay``."""
 
 import argparse
-import os
 
 from runner.cli.commands import Commands, add, add_file, add_settings, count
 from runner.contract import Refused
@@ -49,14 +48,9 @@ def _replay(options: argparse.Namespace) -> int:
         raise Refused("--until and --break each say where to stop; give one")
     if options.verify and changes:
         raise Refused("--verify compares the recording as it is; valid with --from or --swap: nothing else")
-    # Libraries read their thread counts once, when they are imported: an interpreter that says 1 executes.
-    from runner.process.children import PARENT, die_with_parent
-    from runner.process.forks import call_clean, is_clean
+    from runner.process.forks import become_clean
 
-    if not is_clean():
-        return call_clean("runner.cli", *options.arguments)
-    if PARENT in os.environ:
-        die_with_parent()
+    become_clean("runner.cli", *options.arguments)
     execute = _travel if travels else _what_if if changes else _verify
     return execute(options)
 
