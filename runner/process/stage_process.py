@@ -479,28 +479,19 @@ def main() -> int:
         signal.signal(signum, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # there is nothing to finish before the stage is there
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
+    process, code = None, 0
     try:
         process = StageProcess(assignment)
-    except Refused as refusal:
-        return _fail(str(refusal), EXIT_REFUSED)
-    except Exception as error:
-        traceback.print_exc()
-        return _fail(_summary(error), EXIT_FAILED)
-    signal.signal(signal.SIGTERM, lambda *_: process.stop())
-    signal.signal(signal.SIGUSR1, lambda *_: process.retire())
-    return _serve(process)
-
-
-def _serve(process: StageProcess) -> int:
-    code = 0
-    try:
+        signal.signal(signal.SIGTERM, lambda *_: process.stop())
+        signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
     except Refused as refusal:
         code = _fail(str(refusal), EXIT_REFUSED)
     except BaseException as error:
         traceback.print_exc()
         code = _fail(_summary(error), EXIT_FAILED)
-    process.close(failed=code != 0)
+    if process is not None:
+        process.close(failed=code != 0)
     return code
 
 

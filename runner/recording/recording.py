@@ -153,13 +153,19 @@ class Recording:
                 file.seek(0)
                 self._forget()
                 self._read(Container(file, str(path), self.container))
-        self.graph = self._read_graph()
-        """The graph as it ran, with all settings applied."""
-
-    @property
-    def run(self) -> dict[str, str]:
+        self.damage, self.torn = self.container.damage, self.container.torn
+        """Places that do not hold what was written there, as ``byte 4711: reason``; whether the end is missing."""
+        if RUN not in self.metadata:
+            damaged = f" ({self.damage[0]})" if self.damage else ""
+            raise Refused(f"{path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
+        self.run = self.metadata[RUN]
         """What ran where: graph, settings, seed, versions, revision, fingerprint."""
-        return self.metadata[RUN]
+        self.graph = self.aspect("graph", dict[str, Any]())
+        """The graph as it ran, with all settings applied."""
+        try:
+            Proof(self.graph)
+        except msgspec.ValidationError as error:
+            raise Refused(f"{path}: the {RUN!r} metadata holds no readable graph: {error}") from None
 
     @property
     def fingerprint(self) -> str:
@@ -170,16 +176,6 @@ class Recording:
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
         return _decoded(self.run.get(name, ""), type(default)) or default
-
-    @property
-    def damage(self) -> list[str]:
-        """Places that do not hold what was written there, as ``byte 4711: reason``."""
-        return self.container.damage
-
-    @property
-    def torn(self) -> bool:
-        """True where the end of the file is missing."""
-        return self.container.torn
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -232,7 +228,7 @@ class Recording:
             try:
                 self._enter_entry(record)
             except CodecError as error:
-                self.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
+                container.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
 
     def _enter_metadata(self, record: Metadata) -> None:
         if record.name in self.metadata:
@@ -299,14 +295,3 @@ class Recording:
         for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof
-
-    def _read_graph(self) -> dict[str, Any]:
-        if RUN not in self.metadata:
-            damaged = f" ({self.damage[0]})" if self.damage else ""
-            raise Refused(f"{self.path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
-        graph = self.aspect("graph", dict[str, Any]())
-        try:
-            Proof(graph)
-        except msgspec.ValidationError as error:
-            raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph: {error}") from None
-        return graph

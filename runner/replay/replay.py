@@ -7,7 +7,6 @@ lived, runs in a fresh process of its own.
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 import time
 from collections import Counter
@@ -70,8 +69,8 @@ def plan(path: Path) -> list[str]:
     return [f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)]
 
 
-def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> int:
-    """Executes everything again in ``workers`` processes at a time (None: one a core) and compares every byte.
+def verify(path: Path, assignments: Sequence[str], *, workers: int) -> int:
+    """Executes everything again in ``workers`` processes at a time and compares every byte.
 
     Prints what comes of it. Returns 0 where every message is identical, or where this machine is another and every
     message within the graph's tolerances; else 1. Raises Refused where the file is no recording.
@@ -88,7 +87,7 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> in
         if not same:
             tolerances = load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
     results: dict[Task, Result] = {}
-    for task, result in _results(recording, values, tolerances, workers or len(os.sched_getaffinity(0))):
+    for task, result in _results(recording, values, tolerances, workers):
         print(f"{task}: {result}")
         results[task] = result
     found = Summary(change for result in results.values() for change in result.changes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -36,7 +35,7 @@ def what_if(
     assignments: Sequence[str],
     swaps: Sequence[str],
     origins: Sequence[str],
-    workers: int | None,
+    workers: int,
 ) -> int:
     """Executes what follows from a change again and prints what it changes.
 
@@ -52,7 +51,6 @@ def what_if(
     what = f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
     print(*changes, f"{path}: {recording.verdict}", what, sep="\n")
     with tempfile.TemporaryDirectory() as folder:
-        workers = workers or len(os.sched_getaffinity(0))
         replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
         replay.run()
     for line in _verdict(recording, graph, names, replay):

@@ -331,7 +331,7 @@ class Guardian:
         child.replaced_because, child.dies_at = reason, time.monotonic()
         self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
-        if left := self._launch.end_rest(child.process):
+        if left := self._launch.family.end(child.process.path):
             self._say(f"{self._run.name_of(child.process)} {behind(left)}", "warning")
 
     def _start_successor(self, child: Child) -> None:

@@ -75,8 +75,7 @@ class Pulses:
 
     def note(self, pulse: Pulse, arrived_ns: int) -> None:
         """Takes a pulse as it comes."""
-        process = Process(pulse.stage, pulse.replica, pulse.incarnation)
-        self._pulses[process].append((arrived_ns, pulse))
+        self._pulses[pulse.process].append((arrived_ns, pulse))
 
     def newest(self, process: Process) -> Pulse | None:
         """The newest of a process, if any has come."""

@@ -11,29 +11,20 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import LogLine
 from runner.recording.container import new_file
 from runner.recording.recording import Recording
 from runner.view import drawing as d
 from runner.view.views import drawn, load_views
-
-if TYPE_CHECKING:
-    from foxglove import messages as fox
-    from scipy.spatial.transform import Rotation
-else:
-    try:
-        from foxglove import messages as fox
-        from scipy.spatial.transform import Rotation
-    except ImportError:
-        fox = None
 
 STEP_NS = 33_000_000
 """Between the steps of an animation."""
@@ -50,10 +41,8 @@ Head = dict[str, Any]
 def export(path: Path, target: Path) -> list[str]:
     """Writes a recording's drawings and log; returns lines that say what was written.
 
-    Raises Refused where the SDK is missing, the file is no recording, its graph has no views or the target exists.
+    Raises Refused where the file is no recording, its graph has no views or the target exists.
     """
-    if fox is None:
-        raise Refused("runner export: the Foxglove SDK is missing; type: pip install 'scene-programming[foxglove]'")
     recording = Recording(path)
     graph = graph_from_json(recording.run["graph"], str(path))
     views = load_views(graph)

@@ -12,10 +12,15 @@ from runner.recording.recording import kind_of
 from runner.view.drawing import Drawing, Views
 
 
+def require(module: str, what: str, extra: str) -> None:
+    """Raises Refused where ``what`` is not installed, a module that comes with an extra."""
+    if find_spec(module) is None:
+        raise Refused(f"{what} is missing; type: pip install 'scene-programming[{extra}]'")
+
+
 def require_viewer() -> None:
-    """Raises Refused where Rerun, which is an extra, is not installed."""
-    if find_spec("rerun") is None:
-        raise Refused("the viewer is Rerun, which is missing; type: pip install 'scene-programming[view]'")
+    """Raises Refused where Rerun is not installed."""
+    require("rerun", "the viewer is Rerun, which", "view")
 
 
 def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:

@@ -1,6 +1,7 @@
 """Commands that execute a recording again: ``replay``."""
 
 import argparse
+import os
 
 from runner.cli.commands import Commands, add, add_file, add_settings, count
 from runner.contract import Refused
@@ -24,7 +25,8 @@ def add_commands(commands: Commands) -> None:
     text = "execute this stage and what follows from it, changed or not; may be given again"
     replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
     replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
-    replay.add_argument("--workers", type=count, metavar="N", help="stages executed at the same time (one a core)")
+    text, cores = "stages executed at the same time (one a core)", len(os.sched_getaffinity(0))
+    replay.add_argument("--workers", type=count, metavar="N", default=cores, help=text)
     replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
     text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.winner > 0'"
     replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
