@@ -280,6 +280,16 @@ def choose_host(layout: Layout, name: str | None, file: Path) -> str | None:
     return name or layout.head.name
 
 
+def refuse_settings(settings: tuple[str, ...], host: str) -> None:
+    """Settings come from the head with each task; only how to reach it is a host's own. Raises Refused for others."""
+    for setting in settings:
+        key = setting.partition("=")[0]
+        if not (key.startswith("hosts.") or key in ("keys", "router")):
+            raise Refused(
+                f"--set {setting}: settings are the head's, which gives them to {host} with its tasks; type it there"
+            )
+
+
 def _ip(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
         return ipaddress.ip_address(address)

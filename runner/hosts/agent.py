@@ -14,7 +14,6 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Refused
 from runner.graph.document import Document
 from runner.graph.placement import read_layout
 from runner.hosts.head import (
@@ -184,13 +183,3 @@ class Agent:
 
     def _say(self, text: str) -> None:
         self._terminal.show(self._host, text)
-
-
-def refuse_settings(settings: tuple[str, ...], host: str) -> None:
-    """Settings come from the head with each task; only how to reach it is a host's own. Raises Refused for others."""
-    for setting in settings:
-        key = setting.partition("=")[0]
-        if not (key.startswith("hosts.") or key in ("keys", "router")):
-            raise Refused(
-                f"--set {setting}: settings are the head's, which gives them to {host} with its tasks; type it there"
-            )

@@ -6,9 +6,10 @@ from typing import TypeVar
 
 import msgspec
 
+from runner.contract import Refused
 from runner.message import codec
 from runner.message.codec import CodecError
-from runner.message.packet import Packet
+from runner.message.packet import Packet, Process
 
 R = TypeVar("R", bound=msgspec.Struct)
 SHOWN = 10
@@ -33,6 +34,17 @@ class Refusals:
                 self.refuse(packet.key, error)
             else:
                 note(record, packet)
+
+        return take
+
+    def naming(self, note: Callable[[Process], None]) -> Callable[[Packet], None]:
+        """Takes packets and has every process noted that a key names; a key that names none is refused."""
+
+        def take(packet: Packet) -> None:
+            try:
+                note(Process.of(packet.key))
+            except Refused as refusal:
+                self.refuse(packet.key, refusal)
 
         return take
 

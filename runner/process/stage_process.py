@@ -174,7 +174,7 @@ class StageProcess:
         self._bus.hand_over(f"again/{own}/*", lambda packet: self._arrive(packet.end, packet))
         self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._on_ready())
         self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._on_deal))
-        self._bus.hand_over("e/**", self._on_end)
+        self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
         self._heart.start()
@@ -207,12 +207,6 @@ class StageProcess:
     def _on_lost(self, lost: Lost, _: Packet) -> None:
         self._presence.ended(lost.process)
         self._delivery.lost(lost.process)
-
-    def _on_end(self, packet: Packet) -> None:
-        try:
-            self._presence.ended(Process.of(packet.key))
-        except Refused as refusal:
-            self._refusals.refuse(packet.key, refusal)
 
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
         """What a step has done with is acknowledged by it, once the recorder has the step."""

@@ -149,8 +149,8 @@ class Supervisor:
         note_answer = reading(Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
         for key in self._calls.answer_keys:
             hear(f"m/{key}", note_answer)
-        hear("settled/**", partial(self._on_word, self._guardian.settled))
-        hear("e/**", partial(self._on_word, self._guardian.quiet))
+        hear("settled/**", self._refusals.naming(self._guardian.settled.add))
+        hear("e/**", self._refusals.naming(self._guardian.quiet.add))
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
 
@@ -178,13 +178,6 @@ class Supervisor:
             self._refusals.refuse(packet.key, error)
         else:
             self._events.put(End(finished.code, finished.reason))
-
-    def _on_word(self, named: set[Process], packet: Packet) -> None:
-        """What is said of the process that a key names."""
-        try:
-            named.add(Process.of(packet.key))
-        except Refused as refusal:
-            self._refusals.refuse(packet.key, refusal)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
