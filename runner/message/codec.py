@@ -152,9 +152,6 @@ class LogLine(msgspec.Struct, frozen=True):
 class Pulse(OfProcess, frozen=True):
     """What a process says of itself twice a second, of the recorder too; it is not recorded."""
 
-    pid: int
-    host: str
-    """Name of the machine."""
     state: Activity = "waiting"
     handler: str = ""
     """What runs at present; empty while waiting."""
@@ -165,10 +162,6 @@ class Pulse(OfProcess, frozen=True):
     """Messages that could not be taken."""
     queued: dict[str, int] = {}
     """Messages that have arrived and are not worked on, by input port."""
-    skipped: dict[str, int] = {}
-    """Messages that newer ones replaced before they were read, by input port."""
-    unanswered: dict[str, int] = {}
-    """Messages that consumers have not done with, by ``stage.port`` of the consumer."""
     sent: dict[str, tuple[int, int]] = {}
     """(messages, bytes) emitted so far, by output port."""
     cpu_ns: int = 0

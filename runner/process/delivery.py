@@ -123,10 +123,6 @@ class Delivery:
             self._publish(f"m/{self._stage}/{port}", payload)
         self._deal(edges)
 
-    def unanswered(self) -> dict[str, int]:
-        """Messages that consumers have not done with, by ``stage.port``; waits for nobody."""
-        return {f"{edge.route.consumer}.{edge.route.input}": len(edge.unanswered) for edge in self._edges}
-
     def answered(self, consumer: str, done: Iterable[tuple[str, str]]) -> None:
         """Takes note that a consumer has done with (port, message id) pairs."""
         edges = list(self._edges_to(consumer))

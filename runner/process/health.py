@@ -1,8 +1,6 @@
 """Signs of life: what every process says of itself twice a second, and when its silence is one too many."""
 
 import contextlib
-import os
-import platform
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -62,8 +60,6 @@ class Heart:
             stage=own.stage,
             replica=own.replica,
             incarnation=own.incarnation,
-            pid=os.getpid(),
-            host=platform.node(),
             cpu_ns=time.process_time_ns(),
             memory_bytes=self._facts.memory_info().rss,
             **self._say(),

@@ -27,8 +27,6 @@ class Mailbox:
         self._come = dict.fromkeys(node.inputs, 0)
         """By port."""
         self._fetched = dict.fromkeys(node.inputs, 0)
-        self.replaced = dict.fromkeys(node.inputs, 0)
-        """Messages that a newer one replaced before they were decoded."""
 
     def put(self, port: str, packet: Packet) -> None:
         """Takes a packet, from any thread."""
@@ -38,7 +36,6 @@ class Mailbox:
             self._queue.put((port, packet))
             return
         with self._exchanging:
-            self.replaced[port] += port in self._newest
             if port not in self._newest:
                 self._queue.put((port, None))
             self._newest[port] = packet
@@ -128,8 +125,6 @@ class Inbox:
         self._ready: deque[Ready] = deque()
         self.waiting = dict.fromkeys(node.inputs, 0)
         """Messages that no step has taken yet, by port; not those that a join keeps for its parts."""
-        self.skipped = dict.fromkeys(node.inputs, 0)
-        """Messages that a newer one replaced, by port, on edges of policy ``latest``."""
         self._used: set[str] = set()
         """Ids of what is kept and has been part of a step."""
         self._unused: list[tuple[str, str]] = []
@@ -140,7 +135,8 @@ class Inbox:
         handler = self._node.type.takers[arrival.port.name]
         if len(handler.inputs) == 1 and arrival.port.kind == "one":
             if self._node.inputs[arrival.port.name].policy == "latest":
-                self._skip_older(handler, arrival.port)
+                self._ready = deque(ready for ready in self._ready if ready.handler is not handler)
+                self.waiting[arrival.port.name] = 0
             self._count(handler, arrival.port, 1)
             self._ready.append(Ready(handler, (arrival,)))
             return
@@ -215,12 +211,6 @@ class Inbox:
             yield Ready(handler, tuple(arrivals))
         if not any(lineage.values()):
             self._lineages[handler.name].pop(root, None)
-
-    def _skip_older(self, handler: Handler, port: InputPort) -> None:
-        newer = deque(ready for ready in self._ready if ready.handler is not handler)
-        skipped, self._ready = len(self._ready) - len(newer), newer
-        self.skipped[port.name] += skipped
-        self._count(handler, port, -skipped)
 
     def _count(self, handler: Handler, port: InputPort, number: int) -> None:
         if not handler.keeps(port):

@@ -188,8 +188,6 @@ class StageProcess:
             "steps": self._steps,
             "refused": self._refusals.count,
             "queued": {port: waiting + self._mailbox.waiting(port) for port, waiting in queued.items()},
-            "skipped": self._skipped(),
-            "unanswered": self._delivery.unanswered(),
             "sent": dict(self._sent),
         }
 
@@ -374,12 +372,6 @@ class StageProcess:
         """Records what was never worked on."""
         for handler, lineage, lacking in self._inbox.incomplete():
             self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-        for port, skipped in self._skipped().items():
-            if skipped:
-                self._log(f"{port}: {skipped} messages were replaced by newer ones before they were read", "debug")
-
-    def _skipped(self) -> dict[str, int]:
-        return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
 
     def _log(self, text: str, level: Level) -> None:
         line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
