@@ -149,9 +149,8 @@ def _complaints(recording: Recording) -> Iterator[str]:
     yield from (f"damage at {damage}" for damage in recording.damage)
     yield from (f"missing {id}" for id in recording.verdict.missing)
     yield from (f"lost {one.stage}/{one.replica}/{one.incarnation}: {one.reason}" for one in recording.lost)
-    repeated = sum(count > 0 for count in recording.repeated.values())
-    if repeated:
-        yield f"{repeated} messages were sent again after a restart"
+    if recording.repeated:
+        yield f"{len(recording.repeated)} messages were sent again after a restart"
     for line in recording.log:
         if line.level in ("warning", "error"):
             yield f"{line.level} of {line.stage}[{line.replica}]: {line.text}"

@@ -161,7 +161,7 @@ class Pulse(OfProcess, frozen=True):
     refused: int = 0
     """Messages that could not be taken."""
     queued: dict[str, int] = {}
-    """Messages that have arrived and are not worked on, by input port."""
+    """Messages that have arrived and are not worked on, by where they wait: an input port, or before it is known."""
     sent: dict[str, tuple[int, int]] = {}
     """(messages, bytes) emitted so far, by output port."""
     cpu_ns: int = 0

@@ -24,15 +24,10 @@ class Mailbox:
         self._queue: queue.SimpleQueue[tuple[str, Packet | None]] = queue.SimpleQueue()
         self._newest: dict[str, Packet] = {}
         self._exchanging = threading.Lock()
-        self._come = dict.fromkeys(node.inputs, 0)
-        """By port."""
-        self._fetched = dict.fromkeys(node.inputs, 0)
 
     def put(self, port: str, packet: Packet) -> None:
         """Takes a packet, from any thread."""
         if port not in self._latest:
-            if port in self._come:
-                self._come[port] += 1
             self._queue.put((port, packet))
             return
         with self._exchanging:
@@ -53,12 +48,11 @@ class Mailbox:
                     with self._exchanging:
                         fetched = packet or self._newest.pop(port)
                     yield port, fetched
-                    self._fetched[port] = self._fetched.get(port, 0) + (packet is not None)
                 port, packet = self._queue.get_nowait()
 
-    def waiting(self, port: str) -> int:
-        """How many packets of a port wait. May be called from any thread."""
-        return self._come[port] - self._fetched[port] + (port in self._newest)
+    def __len__(self) -> int:
+        """How many packets wait. May be asked from any thread."""
+        return self._queue.qsize()
 
 
 class Parts:

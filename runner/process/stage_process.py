@@ -182,12 +182,12 @@ class StageProcess:
 
     def _vitals(self) -> dict[str, Any]:
         """What the pulse says beyond what holds for any process. Runs on the pulse's thread and waits for nobody."""
-        record, queued = self._present, self._inbox.waiting
+        record = self._present
         return {
             **(record.vitals() if record is not None else {}),
             "steps": self._steps,
             "refused": self._refusals.count,
-            "queued": {port: waiting + self._mailbox.waiting(port) for port, waiting in queued.items()},
+            "queued": {**self._inbox.waiting, "mailbox": len(self._mailbox)},
             "sent": dict(self._sent),
         }
 

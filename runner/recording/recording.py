@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -140,7 +139,7 @@ class Recording:
         self.log: list[LogLine] = []
         self.lost: list[Lost] = []
         """Processes that died."""
-        self.repeated: Counter[str] = Counter()
+        self.repeated: set[str] = set()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
         self._open = lru_cache(OPEN_CHUNKS)(self._envelopes_at)
         self._order: list[tuple[str, int, Record]] = []
@@ -249,7 +248,8 @@ class Recording:
             case Lost():
                 self.lost.append(record)
             case Envelope(id=id):
-                self.repeated[id] += id in self.messages
+                if id in self.messages:
+                    self.repeated.add(id)
                 located = Located(id, record.lineage, entry.topic, record.type, time_ns, len(data), entry.offset)
                 self.messages.setdefault(id, located)
         if VERDICT in self.metadata:

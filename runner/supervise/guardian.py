@@ -261,7 +261,6 @@ class Guardian:
             state = "silent" if child.watch.slow else pulse.state
         return ProcessStatus(
             stage=process.stage,
-            replica=process.replica,
             name=self._run.name_of(process),
             state=state,
             pid=child.handle.pid,

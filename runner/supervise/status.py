@@ -27,7 +27,6 @@ class ProcessStatus(msgspec.Struct, frozen=True):
     """One process of the graph, or the recorder."""
 
     stage: str
-    replica: int
     name: str
     """As log lines call it: with the replica's number where there are several."""
     state: str
