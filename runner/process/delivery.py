@@ -177,5 +177,5 @@ class Delivery:
             if waited - POLL_SECONDS < PATIENCE_SECONDS <= waited:
                 self._warn(
                     f"held back: {edge.route.consumer}.{edge.route.input} has {edge.route.queue} lineages to answer, "
-                    f"the oldest since {next(iter(edge.unanswered))}"
+                    f"the oldest since {next(iter(edge.unanswered), '')}"
                 )

@@ -7,25 +7,18 @@ from collections.abc import Iterable, Iterator
 
 from runner.contract import Tolerance, Tolerances
 from runner.inspect.compare import Difference
-from runner.recording.provenance import (
-    changes,
-    fingerprint,
-    machine,
-    numerical,
-    package_versions,
-    revision,
-    runner_version,
-)
+from runner.recording import provenance
 from runner.recording.recording import Recording
 
 
 def compare_origin(recording: Recording) -> tuple[bool, list[str]]:
     """Whether floats must come out equal to the last bit, and what has changed since the recording, as lines."""
-    packages, here, names = package_versions(), machine(), numerical(recording.graph)
+    changes = provenance.changes
+    packages, here, names = provenance.package_versions(), provenance.machine(), provenance.numerical(recording.graph)
     then = recording.aspect("packages", dict[str, str]())
     # An aspect that an older runner did not record cannot be said to have changed.
     before = {**here, **recording.aspect("machine", dict[str, str]())}
-    same = fingerprint(before, then, names) == fingerprint(here, packages, names)
+    same = provenance.fingerprint(before, then, names) == provenance.fingerprint(here, packages, names)
     lines: list[str] = []
     if not same:
         computing = [
@@ -36,7 +29,7 @@ def compare_origin(recording: Recording) -> tuple[bool, list[str]]:
     others = (name for name in then if name not in names)
     source = {"source": recording.run.get("revision") or "unknown"}
     runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
-    now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
+    now = {"source": provenance.revision(recording.graph) or "unknown", "runner": provenance.runner_version()}
     if other := [*changes(then, packages, others), *changes({**source, **runner}, now, [*source, *runner])]:
         lines.append(f"changed since the recording: {'; '.join(other)}")
     return same, lines
