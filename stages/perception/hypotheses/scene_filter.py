@@ -138,19 +138,29 @@ class SceneFilter:
     ) -> SceneResult:  # fmt: skip
         """The most likely scene of the suspects, most confident first.
 
-        ``starts`` are the looks at each alone, taken here where they are not at hand. A scene that costs ``reached`` is
-        known: a hypothesis whose scenes all must cost more is dropped, and one that ends above it is not polished.
+        ``starts`` are the looks at each alone, taken here where they are not at hand; suspects beyond them are looked
+        for one after the other among those before. A scene that costs ``reached`` is known: a hypothesis whose scenes
+        all must cost more is dropped, and one that ends above it is not polished.
         """
         if not self.looks_first:
             tracks = self._sequence(scene, suspects)
             layers = self._layers(scene, suspects, tracks)
             return self._result(scene, tracks, layers, scene_cost(scene, layers, self._settings.cost))
         begun = list(starts or self.looks(scene, suspects, among=len(suspects)))
-        draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), self._composition(scene, suspects))
-        if (bound := draft.composition.bound()) > reached:
-            return self._result(scene, begun, draft.layers, bound, dropped=True)
+        composition = self._composition(scene, suspects)
+        if (bound := composition.bound()) > reached:
+            return self._result(scene, begun, self._layers(scene, suspects[: len(begun)], begun), bound, dropped=True)
+        begun = self._found_among(scene, suspects, begun)
+        draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), composition)
         self._settle(draft, reached)
         return self._result(scene, draft.tracks, draft.layers, draft.cost)
+
+    def unexplained(
+        self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: Sequence[Track], offers: Sequence[Suspect]
+    ) -> list[float]:
+        """For the box of every offer the share of what stands in it that the scene does not explain."""
+        layers = self._layers(scene, suspects, tracks)
+        return _unexplained(self._composition(scene, suspects), layers, [_window(scene, offer) for offer in offers])
 
     def begun_cost(self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Floats]) -> float:
         """What the scene of first looks costs, poses 3 x 4; estimating its hypothesis ends no higher."""
@@ -174,6 +184,18 @@ class SceneFilter:
             key = _extended(key, suspect)
             tracks.append(self._remembered(key, scene, background, suspect, share))
             background = self._added(background, scene, suspect, tracks[-1])
+        return tracks
+
+    def _found_among(self, scene: ObservedScene, suspects: Sequence[Suspect], begun: Sequence[Track]) -> list[Track]:
+        """The tracks of all suspects: those beyond the given ones are looked for among those before."""
+        tracks = list(begun)
+        key = _extended_by(self._observation_key(scene, 0), b"among")
+        for track in tracks:
+            key = _extended_by(key, track.T_camera_object.tobytes())
+        for suspect in suspects[len(begun) :]:
+            background = _composite(scene, self._layers(scene, suspects[: len(tracks)], tracks))
+            key = _extended(key, suspect)
+            tracks.append(self._run(scene, background, suspect, self._settings.iterations // len(suspects), key))
         return tracks
 
     def _remembered(
@@ -331,12 +353,7 @@ class _Draft:
 
     def unexplained(self) -> list[float]:
         """For every box the share of what stands in it that the scene does not explain."""
-        costs, credit = self.composition.pixels(self.layers), self.composition.credit
-        return [
-            float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
-            / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
-            for window in self._windows
-        ]
+        return _unexplained(self.composition, self.layers, self._windows)
 
     def take(self, i: int, track: Track, layer: Float32s) -> bool:
         """Moves an object where that lowers the cost of the scene."""
@@ -345,6 +362,18 @@ class _Draft:
             return False
         self.tracks[i], self.layers[i], self.cost = track, layer, cost
         return True
+
+
+def _unexplained(
+    composition: Composition, layers: Sequence[Float32s], windows: Sequence[tuple[slice, slice]]
+) -> list[float]:
+    """Of each window the share of what stands in it that the layers do not explain."""
+    costs, credit = composition.pixels(layers), composition.credit
+    return [
+        float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
+        / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
+        for window in windows
+    ]
 
 
 def _window(scene: ObservedScene, suspect: Suspect) -> tuple[slice, slice]:
