@@ -77,6 +77,7 @@ class ParticleFilter(Stage):
         device = chosen_device(config.device, place="particle_filter.device")
         self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, device=device, seed=config.seed)
         self._filter.warm_up()
+        self._seen: tuple[Observation, ObservedScene] | None = None
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
         """A look at one candidate alone, where the form takes one."""
@@ -86,7 +87,7 @@ class ParticleFilter(Stage):
         )
         if candidate is None or not self._filter.looks_first:
             return nothing
-        scene, suspect = _scene(view), _suspect(candidate)
+        scene, suspect = self._scene(view), _suspect(candidate)
         track = self._filter.look(scene, suspect, among=prospect.count)
         unknown = prospect.n_objects is None
         start = Start(T_camera_object=_pose(track), trace=_trace(track))
@@ -98,18 +99,18 @@ class ParticleFilter(Stage):
 
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
         """The most likely scene of the hypothesis and its unnormalised weight."""
-        scene = _scene(observation)
+        scene = self._scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
         reached = self._reached(scene, hypothesis)
-        result = self._filter.estimate(scene, suspects, starts, reached=reached)
+        search = hypothesis.search
+        asked = [_suspect(offer.candidate) for offer in search.offers] if search else []
+        result = self._filter.estimate(scene, suspects, starts, reached=reached, asked=asked)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
         ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
         tracks = [found.track for found in result.objects]
         charges = hypothesis.charges + self._charges(scene, hypothesis, tracks)
-        search = hypothesis.search
-        offers = [_suspect(offer.candidate) for offer in search.offers] if search else []
         # In one that is dropped nobody looks for what has no start.
         objects = zip(names, hypothesis.candidates, result.objects, strict=False)
         return Posterior(
@@ -122,9 +123,17 @@ class ParticleFilter(Stage):
             dropped=result.dropped,
             lambda_r=self.config.lambda_r,
             charges=charges,
-            unexplained=() if result.dropped else tuple(self._filter.unexplained(scene, suspects, tracks, offers)),
+            unexplained=result.unexplained,
             search=search,
         )
+
+    def _scene(self, observation: Observation) -> ObservedScene:
+        """The observation made ready, once for all parts that come with it."""
+        if self._seen is None or self._seen[0] is not observation:
+            seen = observation
+            scene = ObservedScene.of(seen.depth, seen.foreground, seen.K, seen.T_camera_table)
+            self._seen = seen, scene
+        return self._seen[1]
 
     def _charges(self, scene: ObservedScene, hypothesis: Hypothesis, tracks: Sequence[Track]) -> tuple[float, ...]:
         """What the objects that were looked for among the others cost by being there."""
@@ -148,10 +157,6 @@ class ParticleFilter(Stage):
         # For the incumbent itself the charges cancel exactly.
         difference = hypothesis.incumbent_charged - hypothesis.charged
         return self._filter.begun_cost(scene, suspects, poses) + difference
-
-
-def _scene(observation: Observation) -> ObservedScene:
-    return ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
 
 
 def _suspect(candidate: Candidate) -> Suspect:

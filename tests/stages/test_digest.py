@@ -385,9 +385,7 @@ def test_data_sets_with_exact_boxes(name: str, dof: Literal[3, 6], images: int) 
         (observation, hypothesis), _ = enumerate_(
             Hypotheses.Config(), image, detector.on_frame(image, ctx), particle_filter
         )
-        estimate = Ranker(Ranker.Config()).on_posteriors(
-            [particle_filter.on_hypothesis(hypothesis, observation, ctx)], observation, ctx
-        )
+        estimate = ranked(Hypotheses.Config(), [hypothesis], particle_filter, observation)
         catalogue = Catalogue.load(models)
         results += [Result.of(estimate, item, catalogue[item.label].label, -1.0) for item in estimate.objects]
     seen = {(result.scene_id, result.image_id) for result in results}

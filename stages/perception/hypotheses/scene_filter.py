@@ -57,6 +57,8 @@ class SceneResult:
     dropped: bool = False
     """The hypothesis cannot win: ``cost`` is a lower bound of what its scenes cost, and the objects stand where the
     first look saw them."""
+    unexplained: tuple[float, ...] = ()
+    """Of each box that was asked about: the share of what stands in it that the scene leaves unexplained."""
 
 
 class SceneFilter:
@@ -134,13 +136,14 @@ class SceneFilter:
 
     def estimate(
         self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Track] | None = None, *,
-        reached: float = np.inf,
+        reached: float = np.inf, asked: Sequence[Suspect] = (),
     ) -> SceneResult:  # fmt: skip
         """The most likely scene of the suspects, most confident first.
 
         ``starts`` are the looks at each alone, taken here where they are not at hand; suspects beyond them are looked
         for one after the other among those before. A scene that costs ``reached`` is known: a hypothesis whose scenes
-        all must cost more is dropped, and one that ends above it is not polished.
+        all must cost more is dropped, and one that ends above it is not polished. ``asked`` are those whose boxes are
+        asked about.
         """
         if not self.looks_first:
             tracks = self._sequence(scene, suspects)
@@ -153,14 +156,8 @@ class SceneFilter:
         begun = self._found_among(scene, suspects, begun)
         draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), composition)
         self._settle(draft, reached)
-        return self._result(scene, draft.tracks, draft.layers, draft.cost)
-
-    def unexplained(
-        self, scene: ObservedScene, suspects: Sequence[Suspect], tracks: Sequence[Track], offers: Sequence[Suspect]
-    ) -> list[float]:
-        """For the box of every offer the share of what stands in it that the scene does not explain."""
-        layers = self._layers(scene, suspects, tracks)
-        return _unexplained(self._composition(scene, suspects), layers, [_window(scene, offer) for offer in offers])
+        unexplained = draft.unexplained([_window(scene, suspect) for suspect in asked]) if asked else []
+        return replace(self._result(scene, draft.tracks, draft.layers, draft.cost), unexplained=tuple(unexplained))
 
     def begun_cost(self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Floats]) -> float:
         """What the scene of first looks costs, poses 3 x 4; estimating its hypothesis ends no higher."""
@@ -242,7 +239,7 @@ class SceneFilter:
         for number in range(first, first + self._settings.sweeps):
             if number == 1:
                 stale |= self._rescue(draft)
-            left = draft.unexplained()
+            left = draft.unexplained(draft.windows)
             stale = self._sweep(draft, {i for i in stale if left[i] > least}, number)
 
     def _sweep(self, draft: _Draft, stale: set[int], number: int) -> set[int]:
@@ -271,7 +268,7 @@ class SceneFilter:
         share = self._settings.iterations // max(1, len(keys))
         changed: set[int] = set()
         for i, suspect in enumerate(draft.suspects):
-            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained()[i] <= _LEFT:
+            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained(draft.windows)[i] <= _LEFT:
                 continue
             track = self._run(draft.scene, draft.background(i), suspect, share, keys[i])
             changed |= self._moved(draft, i, track)
@@ -337,7 +334,7 @@ class _Draft:
         self.layers = layers
         self.composition = composition
         self.cost = composition.cost(layers)
-        self._windows = [_window(scene, suspect) for suspect in suspects]
+        self.windows = [_window(scene, suspect) for suspect in suspects]
 
     def background(self, i: int) -> Float32s:
         """The plane and all objects but one."""
@@ -345,15 +342,20 @@ class _Draft:
 
     def others_reached(self, i: int) -> set[int]:
         """The objects into whose boxes the layer of object i reaches, itself among them."""
-        return {j for j, window in enumerate(self._windows) if bool((self.layers[i][window] > 0).any())}
+        return {j for j, window in enumerate(self.windows) if bool((self.layers[i][window] > 0).any())}
 
     def cost_without(self, i: int) -> float:
         """Cost of the scene without one object."""
         return self.composition.cost_without(i, self.layers)
 
-    def unexplained(self) -> list[float]:
-        """For every box the share of what stands in it that the scene does not explain."""
-        return _unexplained(self.composition, self.layers, self._windows)
+    def unexplained(self, windows: Sequence[tuple[slice, slice]]) -> list[float]:
+        """For every window the share of what stands in it that the scene does not explain."""
+        costs, credit = self.composition.pixels(self.layers), self.composition.credit
+        return [
+            float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
+            / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
+            for window in windows
+        ]
 
     def take(self, i: int, track: Track, layer: Float32s) -> bool:
         """Moves an object where that lowers the cost of the scene."""
@@ -362,18 +364,6 @@ class _Draft:
             return False
         self.tracks[i], self.layers[i], self.cost = track, layer, cost
         return True
-
-
-def _unexplained(
-    composition: Composition, layers: Sequence[Float32s], windows: Sequence[tuple[slice, slice]]
-) -> list[float]:
-    """Of each window the share of what stands in it that the layers do not explain."""
-    costs, credit = composition.pixels(layers), composition.credit
-    return [
-        float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
-        / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
-        for window in windows
-    ]
 
 
 def _window(scene: ObservedScene, suspect: Suspect) -> tuple[slice, slice]:
