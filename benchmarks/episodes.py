@@ -25,10 +25,8 @@ from stages.scene.truth import Judgement, Truth
 
 M = TypeVar("M", Goal, Outcome, Snapshot, Verdict)
 ROOT = Path(__file__).parents[1]
-SUITES: dict[str, tuple[str, ...]] = {"tray": ()} | {
-    name: (f"world.suite={name}", "hypotheses.n_objects=auto") for name in kinds.DRAWN
-}
-"""Settings by suite: ``tray`` is what the graph lays out as it stands; of the others nobody knows how many objects."""
+SUITES: dict[str, tuple[str, ...]] = {"tray": ()} | {name: (f"world.suite={name}",) for name in kinds.DRAWN}
+"""Settings by suite: ``tray`` is what the graph lays out as it stands."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ Prints how many draws were rejected, and why; the sheet has a goal and a start i
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from PIL import Image
@@ -13,19 +15,30 @@ from PIL import Image
 from runner.testing import run_stage
 from stages.camera import SimulatedCamera
 from stages.devices.suites import kinds
-from stages.messages import Arrangement, Frame, LookRequest
+from stages.messages import Arrangement, Frame, LookRequest, Snapshot
 from stages.scene.catalogue import BUILT_IN
 from stages.world import World
 
 TILE = 480, 360
 
 
-def frames(suite: str, seed: int, camera: SimulatedCamera) -> list[Frame]:
-    """The first look at the goal and at the start scene."""
-    given = [message for kind in ("goal", "start") for message in (Arrangement(kind=kind), LookRequest(purpose=kind))]
-    world = World(World.Config(suite=suite, seed=seed))
-    shown = run_stage(world, given, log=lambda text, _: print(f"{suite} {seed}: {text}", flush=True))
-    return run_stage(camera, shown[1::2])
+def looks(suite: str, seeds: Sequence[int]) -> Iterator[tuple[int, Snapshot, Frame]]:
+    """The first look at the goal and at the start scene of each seed, with the truth."""
+    camera = SimulatedCamera(SimulatedCamera.Config(catalogue=BUILT_IN))
+    asked = [message for kind in ("goal", "start") for message in (Arrangement(kind=kind), LookRequest(purpose=kind))]
+    for seed in seeds:
+        told = partial(_say, f"{suite} {seed}")
+        shown = run_stage(World(World.Config(suite=suite, seed=seed)), asked, log=told)
+        for snapshot in shown[1::2]:
+            assert isinstance(snapshot, Snapshot)
+            (frame,) = run_stage(camera, [snapshot])
+            assert isinstance(frame, Frame)
+            yield seed, snapshot, frame
+    camera.close()
+
+
+def _say(name: str, text: str, level: str) -> None:
+    print(f"{name}: {text}", flush=True)
 
 
 def sheet(rows: list[list[Frame]]) -> Image.Image:
@@ -44,9 +57,8 @@ def main() -> None:
     parser.add_argument("seeds", type=int, nargs="+")
     parser.add_argument("--sheet", type=Path, help="PNG to write")
     options = parser.parse_args()
-    camera = SimulatedCamera(SimulatedCamera.Config(catalogue=BUILT_IN))
-    rows = [frames(options.suite, seed, camera) for seed in options.seeds]
-    camera.close()
+    frames = [frame for _, _, frame in looks(options.suite, options.seeds)]
+    rows = [frames[k : k + 2] for k in range(0, len(frames), 2)]
     if options.sheet:
         sheet(rows).quantize(128, dither=Image.Dither.NONE).save(options.sheet, optimize=True)
 

@@ -21,7 +21,8 @@ from stages.scene.catalogue import Catalogue
 
 
 class SimulatedCamera(Stage):
-    """The simulated robot's camera: renders each snapshot as a structured-light camera would see it."""
+    """The simulated robot's camera: renders each snapshot as a structured-light camera would see it that nobody
+    calibrated today."""
 
     device: ClassVar[bool] = True
 
@@ -53,7 +54,8 @@ class SimulatedCamera(Stage):
     def on_snapshot(self, snapshot: Snapshot, ctx: Context) -> Frame:
         """The image, which is said to be from where the encoders have the camera."""
         T_base_camera = self._robot.camera_pose(snapshot.joint_names, snapshot.joint_positions)
-        rgb, depth = self._camera.image(snapshot, T_base_camera)
+        shown = snapshot if self._noise else msgspec.structs.replace(snapshot, errors=None)
+        rgb, depth = self._camera.image(shown, T_base_camera)
         if self._noise:
             rgb, depth = color_noise(rgb, ctx.rng), structured_light(depth, self._K, ctx.rng)
         self._looks += 1

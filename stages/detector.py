@@ -31,8 +31,8 @@ class Detector(Stage):
         weights: Path = _WEIGHTS
         threshold: float = 0.3
         expected: int | Literal["auto"] = "auto"
-        """Objects known to be there, ``auto`` (as 0) where nobody knows: where fewer reach the threshold, what reaches
-        ``floor`` is kept as well, since an object that is mostly hidden is better doubted than missed."""
+        """Objects known to be there; ``auto`` where nobody knows. Then, or where fewer reach the threshold, what
+        reaches ``floor`` is kept too: an object that is mostly hidden is better doubted than missed."""
         floor: float = 0.05
         max_boxes: int = 12
         labels: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ class Detector(Stage):
         sure = int((found.scores >= config.threshold).sum())
         # A second box of one object, or one of its part, is no other object.
         objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
-        kept = slice(sure if config.expected == "auto" or objects >= config.expected else None)
+        kept = slice(sure if config.expected != "auto" and objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message

@@ -30,7 +30,7 @@ from stages.messages import (
     SceneEstimate,
     SceneGraph,
 )
-from stages.messages.digest import Prospect, Sighting
+from stages.messages.digest import Contender, Prospect, Sighting
 from stages.messages.scene import UnknownRegion
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
@@ -155,11 +155,15 @@ class SceneEstimator:
         if self.appraiser is not None:
             sightings = list(self.appraiser.on_sightings(sightings, observation, ctx))
             yield from sightings
-        hypotheses = list(self.hypotheses.on_sightings(sightings, ctx))
-        yield from hypotheses
-        posteriors = self.filters.estimate(hypotheses, observation)
-        yield from posteriors
-        ranked = self.ranker.on_posteriors(posteriors, observation, ctx)
+        found: list[Hypothesis | Contender] = list(self.hypotheses.on_sightings(sightings, ctx))
+        while hypotheses := [part for part in found if isinstance(part, Hypothesis)]:
+            yield from hypotheses
+            posteriors = self.filters.estimate(hypotheses, observation)
+            yield from posteriors
+            found = list(self.hypotheses.on_posteriors(posteriors, ctx))
+        contenders = [part for part in found if isinstance(part, Contender)]
+        yield from contenders
+        ranked = self.ranker.on_contenders(contenders, observation, ctx)
         yield ranked
         yield self.refiner.on_scene_estimate(ranked, observation, ctx)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
+import numpy as np
+
 from runner.contract import Context, Refused, Stage
-from stages.messages import Candidate, Candidates, Frame, Hypothesis, Observation
-from stages.messages.digest import Glimpse, Placed, Prospect, Sighting, Start
+from stages.messages import Candidate, Candidates, Frame, Hypothesis, ObjectPose, Observation, Posterior
+from stages.messages.digest import Contender, Glimpse, Offer, Placed, Prospect, Search, Sighting, Start
 from stages.perception.hypotheses.combinations import (
     additions_first,
     cheapest,
@@ -19,6 +22,7 @@ from stages.perception.hypotheses.combinations import (
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
+from stages.perception.hypotheses.revisions import Revision, is_better, revisions
 from stages.perception.observation.preprocessing import preprocess
 
 
@@ -42,6 +46,9 @@ class Hypotheses(Stage):
 
     Each candidate is looked at alone first, once for all hypotheses, and those go on whose objects together would cost
     least as they stand. The paper's plain form takes no such look; the most confident combinations go on.
+
+    Where N_c is not known, the best scene is revised while that makes it better: what it leaves unexplained may be an
+    object that it leaves out, or one of its own that stands elsewhere. Alone, both may have been hidden by the others.
     """
 
     @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +61,8 @@ class Hypotheses(Stage):
         """Cap on h without first looks, highest joint confidence first."""
         finalists: int = 8
         """Cap on h with first looks, least cost first."""
+        revisions: int = 4
+        """Rounds in which the best scene is revised at most, where N_c is not known."""
         max_height: float = 0.6
         """Metres above the support plane beyond which a reading belongs to no object."""
 
@@ -63,6 +72,8 @@ class Hypotheses(Stage):
             for name in ("max_hypotheses", "finalists"):
                 if getattr(self, name) < 1:
                     raise Refused(f"hypotheses.{name} is {getattr(self, name)}; it must be 1 or more")
+            if self.revisions < 0:
+                raise Refused(f"hypotheses.revisions is {self.revisions}; it must be 0 or more")
             if self.max_height <= 0:
                 raise Refused(f"hypotheses.max_height is {self.max_height} m; it must be above 0")
 
@@ -86,6 +97,23 @@ class Hypotheses(Stage):
             yield from self._cheapest(_distinct(found, ctx), number, ctx)
         else:
             yield from self._most_confident([s.candidate for s in sightings if s.candidate is not None], number, ctx)
+
+    def on_posteriors(self, posteriors: list[Posterior], ctx: Context) -> Iterator[Hypothesis | Contender]:
+        """Revisions of the best scene so far, or all hypotheses for the ranking once these are in vain."""
+        search = posteriors[0].search
+        earlier = search.earlier if search else ()
+        contenders = (*earlier, *map(_contender, posteriors))
+        best = max(posteriors, key=lambda each: each.log_weight)
+        known = max((each.log_weight for each in earlier), default=-np.inf)
+        revised: list[Revision] = []
+        if search and search.rounds < self.config.revisions and is_better(best.log_weight, known):
+            revised = revisions(best, search.offers)[: self.config.finalists]
+        if search and revised:
+            ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained")
+            following = msgspec.structs.replace(search, earlier=contenders, rounds=search.rounds + 1)
+            yield from _revised(best, revised, following)
+        for index, each in enumerate(() if revised else contenders):
+            yield msgspec.structs.replace(each, index=index, count=len(contenders))
 
     def _most_confident(self, candidates: list[Candidate], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
         if number is None and candidates:
@@ -115,6 +143,8 @@ class Hypotheses(Stage):
             Placed(candidate=found[i].candidate, T_camera_object=found[i].start.T_camera_object)
             for i in combinations[0]
         )
+        offers = tuple(Offer(candidate=each.candidate, share=each.share) for each in found)
+        search = None if number is not None else Search(offers=offers)
         for index, chosen in enumerate(combinations):
             yield Hypothesis(
                 index=index,
@@ -125,6 +155,8 @@ class Hypotheses(Stage):
                 incumbent=incumbent,
                 charged=sum(charges[i] for i in chosen),
                 incumbent_charged=sum(charges[i] for i in combinations[0]),
+                charges=() if number is not None else tuple(charges[i] for i in chosen),
+                search=search,
             )
 
     def _n_objects(self, frame: Frame) -> int | None:
@@ -138,6 +170,42 @@ class Hypotheses(Stage):
             f"{frame.name}: the number of objects is not known; set hypotheses.n_objects to a whole number or auto, or "
             "use a data set with a targets file"
         )
+
+
+def _contender(posterior: Posterior) -> Contender:
+    return Contender(
+        index=posterior.index,
+        count=posterior.count,
+        objects=posterior.objects,
+        log_weight=posterior.log_weight,
+        left_out=posterior.left_out,
+        lambda_r=posterior.lambda_r,
+    )
+
+
+def _revised(best: Posterior, revised: Sequence[Revision], search: Search) -> Iterator[Hypothesis]:
+    """Hypotheses that begin with the best scene."""
+    offers = search.offers
+    placed = tuple(Placed(candidate=_candidate(item), T_camera_object=item.T_camera_object) for item in best.objects)
+    for index, each in enumerate(revised):
+        charges = tuple(best.charges[i] for i in each.kept)
+        yield Hypothesis(
+            index=index,
+            count=len(revised),
+            candidates=(*(placed[i].candidate for i in each.kept), *(offers[k].candidate for k in each.new)),
+            left_out=best.left_out,
+            starts=tuple(Start(T_camera_object=placed[i].T_camera_object, trace=best.traces[i]) for i in each.kept),
+            incumbent=placed,
+            charged=sum(charges),
+            incumbent_charged=sum(best.charges),
+            charges=charges,
+            shares=tuple(offers[k].share for k in each.new),
+            search=search if index == 0 else msgspec.structs.replace(search, earlier=()),
+        )
+
+
+def _candidate(item: ObjectPose) -> Candidate:
+    return Candidate(label=item.label, box=item.box, confidence=item.confidence)
 
 
 def _distinct(found: list[_Found], ctx: Context) -> list[_Found]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,7 @@ from stages.perception.cuda.device import DEVICES, chosen_device
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.particle_filter import Track
 from stages.perception.filter.settings import FilterSettings
+from stages.perception.hypotheses.composition import charge
 from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
 from stages.scene.catalogue import Catalogue
 from stages.scene.naming import unique_names
@@ -75,6 +77,7 @@ class ParticleFilter(Stage):
         device = chosen_device(config.device, place="particle_filter.device")
         self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, device=device, seed=config.seed)
         self._filter.warm_up()
+        self._seen: tuple[Observation, ObservedScene] | None = None
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
         """A look at one candidate alone, where the form takes one."""
@@ -84,38 +87,66 @@ class ParticleFilter(Stage):
         )
         if candidate is None or not self._filter.looks_first:
             return nothing
-        scene, suspect = _scene(view), _suspect(candidate)
+        scene, suspect = self._scene(view), _suspect(candidate)
         track = self._filter.look(scene, suspect, among=prospect.count)
-        start = Start(T_camera_object=_pose(track), trace=_trace(track))
         unknown = prospect.n_objects is None
+        start = Start(T_camera_object=_pose(track), trace=_trace(track))
         if unknown:
-            rise, claim, explained = self._filter.worth(scene, suspect, track)
-            start = msgspec.structs.replace(start, rise=rise, claim=claim, explained=explained)
+            start = self._start(scene, suspect, track)
         return msgspec.structs.replace(
             nothing, start=start, glimpse=self._filter.glimpse(scene, suspect, track, anywhere=unknown)
         )
 
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
         """The most likely scene of the hypothesis and its unnormalised weight."""
-        scene = _scene(observation)
+        scene = self._scene(observation)
         suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
         starts = [_track(start) for start in hypothesis.starts]
         reached = self._reached(scene, hypothesis)
-        result = self._filter.estimate(scene, suspects, starts, reached=reached)
+        search = hypothesis.search
+        asked = [_suspect(offer.candidate) for offer in search.offers] if search else []
+        result = self._filter.estimate(scene, suspects, starts, reached=reached, asked=asked)
         names = unique_names([candidate.label for candidate in hypothesis.candidates])
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
         ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
-        objects = zip(names, hypothesis.candidates, result.objects, strict=True)
+        tracks = [found.track for found in result.objects]
+        charges = hypothesis.charges + self._charges(scene, hypothesis, tracks)
+        # In one that is dropped nobody looks for what has no start.
+        objects = zip(names, hypothesis.candidates, result.objects, strict=False)
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
             objects=tuple(_object(*each) for each in objects),
-            log_weight=-self.config.lambda_r * (result.cost + hypothesis.charged),
+            log_weight=-self.config.lambda_r * (result.cost + sum(charges)),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
             dropped=result.dropped,
             lambda_r=self.config.lambda_r,
+            charges=charges,
+            unexplained=result.unexplained,
+            search=search,
         )
+
+    def _scene(self, observation: Observation) -> ObservedScene:
+        """The observation made ready, once for all parts that come with it."""
+        if self._seen is None or self._seen[0] is not observation:
+            seen = observation
+            scene = ObservedScene.of(seen.depth, seen.foreground, seen.K, seen.T_camera_table)
+            self._seen = seen, scene
+        return self._seen[1]
+
+    def _charges(self, scene: ObservedScene, hypothesis: Hypothesis, tracks: Sequence[Track]) -> tuple[float, ...]:
+        """What the objects that were looked for among the others cost by being there."""
+        first = len(hypothesis.charges)
+        new = zip(hypothesis.candidates[first:], tracks[first:], hypothesis.shares, strict=False)
+        return tuple(
+            charge(candidate.box, self._start(scene, _suspect(candidate), track), share)
+            for candidate, track, share in new
+        )
+
+    def _start(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Start:
+        rise, claim, explained = self._filter.worth(scene, suspect, track)
+        return Start(T_camera_object=_pose(track), trace=_trace(track), rise=rise, claim=claim, explained=explained)
 
     def _reached(self, scene: ObservedScene, hypothesis: Hypothesis) -> float:
         """What a scene of the hypothesis may cost and still weigh as much as the known one."""
@@ -126,10 +157,6 @@ class ParticleFilter(Stage):
         # For the incumbent itself the charges cancel exactly.
         difference = hypothesis.incumbent_charged - hypothesis.charged
         return self._filter.begun_cost(scene, suspects, poses) + difference
-
-
-def _scene(observation: Observation) -> ObservedScene:
-    return ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
 
 
 def _suspect(candidate: Candidate) -> Suspect:

@@ -1,4 +1,4 @@
-"""Posteriors of all hypotheses in, the maximal likely scene out."""
+"""All estimated hypotheses in, the maximal likely scene out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Stage
-from stages.messages import ObjectPose, Observation, Posterior, SceneEstimate
+from stages.messages import ObjectPose, Observation, SceneEstimate
+from stages.messages.digest import Contender
 from stages.perception.hypotheses.duplicates import is_same_scene, without_doubles
 from stages.scene.naming import Named, names_kept, unique_names
 
@@ -30,12 +31,12 @@ class Ranker(Stage):
         self.config = config
         self._known: dict[str, Named] = {}
 
-    def on_posteriors(self, posteriors: list[Posterior], observation: Observation, ctx: Context) -> SceneEstimate:
+    def on_contenders(self, contenders: list[Contender], observation: Observation, ctx: Context) -> SceneEstimate:
         """The scene of greatest weight; of equals, the one of the more confident hypothesis (lower index)."""
-        log_weights = np.array([posterior.log_weight for posterior in posteriors], float)
+        log_weights = np.array([each.log_weight for each in contenders], float)
         winner = int(np.argmax(log_weights))
-        best = posteriors[winner]
-        scenes = [without_doubles(posterior.objects) for posterior in posteriors]
+        best = contenders[winner]
+        scenes = [without_doubles(each.objects) for each in contenders]
         return SceneEstimate(
             objects=self._named(scenes[winner], observation),
             winner=winner,

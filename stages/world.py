@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.devices.miscalibration import Miscalibration
 from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.placing import moved
@@ -55,8 +56,8 @@ class World(Stage):
         self._robot = read_robot(config.robot)
         self._suite = kinds.suite(config.suite, self._catalogue, self._robot, config.seed, goal=config.goal)
         self._looks = 0
-        errors = self._suite.errors(np.random.default_rng(config.seed))
-        self._beyond = np.zeros(len(self._robot.joint_names)) if errors is None else errors.joints
+        rng = np.random.default_rng([config.seed, 4])
+        self._wrong = Miscalibration.draw(rng, self._robot, joints=self._suite.joints)
         self._simulation = Simulation(self._catalogue, self._robot, self._suite.names, self._suite.table)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
@@ -83,7 +84,7 @@ class World(Stage):
     def on_look_request(self, look_request: LookRequest) -> Snapshot:
         """The world as it is now, for the simulated camera."""
         table = self._suite.table
-        errors = self._suite.errors(np.random.default_rng([self._config.seed, 3, self._looks]))
+        rng = np.random.default_rng([self._config.seed, 3, self._looks])
         self._looks += 1
         return Snapshot(
             names=self._simulation.present,
@@ -94,14 +95,14 @@ class World(Stage):
             purpose=look_request.purpose,
             T_base_table=pose(np.eye(3), np.array([*table.center, table.height])),
             table_size=np.array(table.size),
-            errors=errors,
+            errors=self._wrong.at_a_look(rng),
         )
 
     def on_robot_command(self, robot_command: RobotCommand) -> RobotState:
         """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders."""
         error = 0.0
         if len(robot_command.times):
-            beyond = [self._beyond[self._robot.joint_names.index(name)] for name in robot_command.joint_names]
+            beyond = [self._wrong.joints[self._robot.joint_names.index(name)] for name in robot_command.joint_names]
             error = self._simulation.follow(
                 robot_command.joint_names,
                 robot_command.times,
@@ -139,7 +140,7 @@ class World(Stage):
         )
 
     def _encoders(self) -> Floats:
-        return self._simulation.encoders() - self._beyond
+        return self._simulation.encoders() - self._wrong.joints
 
     def _state(self, tracking_error: float = 0.0) -> RobotState:
         return RobotState(

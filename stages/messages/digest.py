@@ -100,6 +100,33 @@ class Sighting(Part, frozen=True, kw_only=True):
     glimpse: Glimpse | None = None
 
 
+class Offer(Struct, frozen=True, kw_only=True):
+    """A candidate that may be part of the scene, whichever hypothesis leaves it out."""
+
+    candidate: Candidate
+    share: float
+    """Of what it claims that its object must explain."""
+
+
+class Contender(Part, frozen=True, kw_only=True):
+    """A hypothesis that was estimated, for the ranking of all of them."""
+
+    objects: tuple[ObjectPose, ...]
+    log_weight: float
+    left_out: int = 0
+    lambda_r: float = 1.0
+
+
+class Search(Struct, frozen=True, kw_only=True):
+    """What the search over scenes knows when it begins a round; the first part of the round carries it."""
+
+    offers: tuple[Offer, ...]
+    earlier: tuple[Contender, ...] = ()
+    """The hypotheses of the rounds before."""
+    rounds: int = 0
+    """How many these are."""
+
+
 class Placed(Struct, frozen=True, kw_only=True):
     """A candidate's object at a pose."""
 
@@ -114,7 +141,14 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     left_out: int = 0
     """Combinations of the frame that the cap left out."""
     starts: tuple[Start, ...] = ()
-    """Of each candidate, where there were looks at each alone."""
+    """Of each candidate, where there were looks at each alone. In later rounds the last candidates have none: they are
+    looked for among the others, in this order."""
+    charges: tuple[float, ...] = ()
+    """What each object with a start costs by being there, metres times pixels, where N_c is not known."""
+    shares: tuple[float, ...] = ()
+    """Of what those without a start claim that they must explain."""
+    search: Search | None = None
+    """None where N_c is known: nothing is revised. In other parts than the first it knows the offers only."""
     incumbent: tuple[Placed, ...] = ()
     """A scene that is known: hypotheses all of whose scenes cost more are dropped."""
     charged: float = 0.0
@@ -136,6 +170,12 @@ class Posterior(Part, frozen=True, kw_only=True):
     """The hypothesis cannot win: ``log_weight`` is an upper bound, the objects stand where they start."""
     lambda_r: float = 1.0
     """Scale of the weight: ``log_weight`` is minus this times the cost, metres times pixels."""
+    charges: tuple[float, ...] = ()
+    """What each object costs by being there, metres times pixels, where N_c is not known."""
+    unexplained: tuple[float, ...] = ()
+    """Of every offer of the search: the share of what stands in its box that the scene does not explain."""
+    search: Search | None = None
+    """The hypothesis's."""
 
 
 class SceneEstimate(Message, frozen=True, kw_only=True):

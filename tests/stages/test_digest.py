@@ -23,13 +23,13 @@ from stages.messages import (
     Candidate,
     Candidates,
     Frame,
+    Hypothesis,
     ObjectPose,
     Observation,
-    Posterior,
     SceneEstimate,
     SceneGraph,
 )
-from stages.messages.digest import Prospect, Sighting
+from stages.messages.digest import Contender, Prospect, Sighting
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
 from stages.results import BopResults
@@ -66,6 +66,17 @@ def enumerate_(
         if isinstance(each, Prospect)
     ]
     return [observation, *stage.on_sightings(sightings, ctx)], ctx
+
+
+def ranked(
+    config: Hypotheses.Config, begun: list[Hypothesis], filter_stage: ParticleFilter, observation: Observation
+) -> SceneEstimate:
+    """The best scene, after all revisions."""
+    stage, ctx = Hypotheses(config), Recorded()
+    found: list = begun
+    while isinstance(found[0], Hypothesis):
+        found = list(stage.on_posteriors([filter_stage.on_hypothesis(h, observation, ctx) for h in found], ctx))
+    return Ranker(Ranker.Config()).on_contenders(found, observation, ctx)
 
 
 def blind(prospect: Prospect) -> Sighting:
@@ -123,7 +134,9 @@ def test_an_image_without_depth_is_refused(seen: Rendered) -> None:
         enumerate_(Hypotheses.Config(n_objects=1), dark, candidates())
 
 
-@pytest.mark.parametrize("field", [{"n_objects": -1}, {"max_hypotheses": 0}, {"finalists": 0}, {"max_height": 0.0}])
+@pytest.mark.parametrize(
+    "field", [{"n_objects": -1}, {"max_hypotheses": 0}, {"finalists": 0}, {"revisions": -1}, {"max_height": 0.0}]
+)
 def test_settings_are_checked(field: dict) -> None:
     with pytest.raises(Refused, match=f"hypotheses.{next(iter(field))} is"):
         Hypotheses.Config(**field)
@@ -147,7 +160,7 @@ def test_the_true_scene_outweighs_the_false_one(seen: Rendered, filter_stage: Pa
     found = candidates(*((c.label, c.box, c.confidence) for c in both(seen).candidates), false)
     (observation, *hypotheses), ctx = enumerate_(Hypotheses.Config(n_objects=2), frame(seen), found, filter_stage)
     posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
-    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    estimate = ranked(Hypotheses.Config(n_objects=2), hypotheses, filter_stage, observation)
     assert sorted(item.name for item in estimate.objects) == ["mug", "tea_box"]
     assert sorted(item.name for p in posteriors for item in p.objects if item.name[-1].isdigit()) == ["tea_box_2"]
     for item in estimate.objects:
@@ -178,8 +191,7 @@ def test_the_number_of_objects_is_found(seen: Rendered, filter_stage: ParticleFi
     assert [h.left_out for h in hypotheses] == [4] * 4
     assert "1 of 4 candidates show an object once more: left out" in ctx.lines[0]
     assert "4 of 8 hypotheses, 4 of the dearest at first look left out (hypotheses.finalists)" in ctx.lines[1]
-    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
-    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
     assert sorted(item.label for item in estimate.objects) == ["mug", "tea_box"]
 
 
@@ -204,19 +216,30 @@ def test_what_lies_flat_is_found_too(filter_stage: ParticleFilter) -> None:
     loose = laden.boxes["tray"] + np.array([-30.0, -20.0, 30.0, 20.0])
     found = candidates(("tray", loose, 0.9), ("tea_box", laden.boxes["tea_box"], 0.9))
     config = Hypotheses.Config(n_objects="auto")
-    (observation, *hypotheses), ctx = enumerate_(config, frame(laden), found, filter_stage)
-    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
-    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    (observation, *hypotheses), _ = enumerate_(config, frame(laden), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
     assert sorted(item.label for item in estimate.objects) == ["tea_box", "tray"]
+
+
+def test_what_others_hid_from_the_look_at_it_alone_is_found_by_revising(filter_stage: ParticleFilter) -> None:
+    heap = {"tray": upright("tray", 0.0, 0.0, 0.3), "cereal_box": upright("cereal_box", -0.08, -0.03, 0.5)}
+    heap |= {"bowl": upright("bowl", 0.09, -0.02, 0.0), "milk_carton": upright("milk_carton", 0.02, 0.05, 0.2)}
+    laden = render(heap)
+    found = candidates(*((label, laden.boxes[label], 0.9) for label in heap))
+    for revisions, labels in ((0, set(heap) - {"tray"}), (1, set(heap))):
+        config = Hypotheses.Config(n_objects="auto", finalists=1, revisions=revisions)
+        (observation, *hypotheses), _ = enumerate_(config, frame(laden), found, filter_stage)
+        estimate = ranked(config, hypotheses, filter_stage, observation)
+        assert {item.label for item in estimate.objects} == labels
+        assert len(estimate.log_weights) == 1 + revisions
 
 
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))
     config = Hypotheses.Config(n_objects="auto")
-    (observation, *hypotheses), ctx = enumerate_(config, frame(bare), found, filter_stage)
-    posteriors = [filter_stage.on_hypothesis(h, observation, ctx) for h in hypotheses]
-    assert Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx).objects == ()
+    (observation, *hypotheses), _ = enumerate_(config, frame(bare), found, filter_stage)
+    assert ranked(config, hypotheses, filter_stage, observation).objects == ()
 
 
 def test_the_plain_form_cannot_find_the_number_of_objects(seen: Rendered) -> None:
@@ -230,14 +253,14 @@ def test_an_empty_hypothesis_has_an_empty_scene(seen: Rendered, filter_stage: Pa
     assert posterior.objects == () and posterior.log_weight < 0
 
 
-def posterior(index: int, log_weight: float) -> Posterior:
-    return Posterior(index=index, count=3, objects=(), log_weight=log_weight)
+def contender(index: int, log_weight: float) -> Contender:
+    return Contender(index=index, count=3, objects=(), log_weight=log_weight)
 
 
 def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
     (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
     weights = (-3.0, -1.0, -1.0)
-    estimate = Ranker(Ranker.Config()).on_posteriors([posterior(*p) for p in enumerate(weights)], observation, ctx)
+    estimate = Ranker(Ranker.Config()).on_contenders([contender(*p) for p in enumerate(weights)], observation, ctx)
     assert estimate.winner == 1 and estimate.log_weights.tolist() == list(weights)
     assert (estimate.scene_id, estimate.image_id, estimate.name) == (3, 7, "scene")
 
@@ -245,12 +268,12 @@ def test_ties_go_to_the_lower_index(seen: Rendered) -> None:
 def test_a_scene_that_is_found_twice_is_one_scene(seen: Rendered) -> None:
     (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
     scenes = [estimate_of({label: seen.poses[label]}).objects for label in ("mug", "tea_box", "mug")]
-    posteriors = [msgspec.structs.replace(posterior(i, w), objects=scenes[i]) for i, w in enumerate((-2.0, -3.0, -1.5))]
-    estimate = Ranker(Ranker.Config()).on_posteriors(posteriors, observation, ctx)
+    contenders = [msgspec.structs.replace(contender(i, w), objects=scenes[i]) for i, w in enumerate((-2.0, -3.0, -1.5))]
+    estimate = Ranker(Ranker.Config()).on_contenders(contenders, observation, ctx)
     assert (estimate.winner, estimate.repeated) == (2, (0,))
 
 
-def seen_from_a_known_camera(*xs: float) -> tuple[list[Posterior], Observation]:
+def seen_from_a_known_camera(*xs: float) -> tuple[list[Contender], Observation]:
     """Cups along the robot's x axis, the most confident first."""
     cups = tuple(
         ObjectPose(
@@ -263,13 +286,13 @@ def seen_from_a_known_camera(*xs: float) -> tuple[list[Posterior], Observation]:
         depth=np.ones((2, 2), np.float32), rgb=np.zeros((2, 2, 3), np.uint8), foreground=np.ones((2, 2), bool), K=K,
         T_camera_table=np.eye(4), T_base_camera=np.eye(4),
     )  # fmt: skip
-    return [Posterior(index=0, count=1, objects=cups, log_weight=-1.0)], observation
+    return [Contender(index=0, count=1, objects=cups, log_weight=-1.0)], observation
 
 
 def test_equal_objects_keep_their_names_from_look_to_look_by_where_they_stand() -> None:
     ranker = Ranker(Ranker.Config())
     first, swapped, moved = (
-        ranker.on_posteriors(*seen_from_a_known_camera(*xs), Recorded())
+        ranker.on_contenders(*seen_from_a_known_camera(*xs), Recorded())
         for xs in ((0.0, 0.3), (0.301, 0.002), (0.7, 0.0))
     )
     assert [item.name for item in first.objects] == ["cup", "cup_2"]
@@ -280,9 +303,9 @@ def test_equal_objects_keep_their_names_from_look_to_look_by_where_they_stand() 
 def test_looks_of_a_camera_that_does_not_know_where_it_is_have_nothing_to_do_with_each_other() -> None:
     ranker = Ranker(Ranker.Config())
     for xs in ((0.0, 0.3), (0.3, 0.0)):
-        posteriors, observation = seen_from_a_known_camera(*xs)
+        contenders, observation = seen_from_a_known_camera(*xs)
         unknown = msgspec.structs.replace(observation, T_base_camera=None)
-        estimate = ranker.on_posteriors(posteriors, unknown, Recorded())
+        estimate = ranker.on_contenders(contenders, unknown, Recorded())
         assert [item.name for item in estimate.objects] == ["cup", "cup_2"]
 
 
@@ -362,9 +385,7 @@ def test_data_sets_with_exact_boxes(name: str, dof: Literal[3, 6], images: int) 
         (observation, hypothesis), _ = enumerate_(
             Hypotheses.Config(), image, detector.on_frame(image, ctx), particle_filter
         )
-        estimate = Ranker(Ranker.Config()).on_posteriors(
-            [particle_filter.on_hypothesis(hypothesis, observation, ctx)], observation, ctx
-        )
+        estimate = ranked(Hypotheses.Config(), [hypothesis], particle_filter, observation)
         catalogue = Catalogue.load(models)
         results += [Result.of(estimate, item, catalogue[item.label].label, -1.0) for item in estimate.objects]
     seen = {(result.scene_id, result.image_id) for result in results}

@@ -10,7 +10,6 @@ import numpy as np
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.tabletop import HIDDEN, Layout
 from stages.geometry.arrays import Floats
-from stages.messages import SensorErrors
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
 
@@ -31,6 +30,8 @@ class Suite(ABC):
     names: tuple[str, ...]
     """All objects that any scene has; a scene may do without some."""
     table: Table
+    joints = 0.0
+    """Radians by which encoders are off at most."""
 
     @abstractmethod
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
@@ -39,10 +40,6 @@ class Suite(ABC):
         Raises:
             Rejected: it is impossible.
         """
-
-    def errors(self, rng: np.random.Generator) -> SensorErrors | None:
-        """What is wrong with camera and encoders at one look; None where nothing is."""
-        return None
 
 
 class Drawn(Suite):

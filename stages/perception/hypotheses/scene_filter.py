@@ -57,6 +57,8 @@ class SceneResult:
     dropped: bool = False
     """The hypothesis cannot win: ``cost`` is a lower bound of what its scenes cost, and the objects stand where the
     first look saw them."""
+    unexplained: tuple[float, ...] = ()
+    """Of each box that was asked about: the share of what stands in it that the scene leaves unexplained."""
 
 
 class SceneFilter:
@@ -134,23 +136,28 @@ class SceneFilter:
 
     def estimate(
         self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Track] | None = None, *,
-        reached: float = np.inf,
+        reached: float = np.inf, asked: Sequence[Suspect] = (),
     ) -> SceneResult:  # fmt: skip
         """The most likely scene of the suspects, most confident first.
 
-        ``starts`` are the looks at each alone, taken here where they are not at hand. A scene that costs ``reached`` is
-        known: a hypothesis whose scenes all must cost more is dropped, and one that ends above it is not polished.
+        ``starts`` are the looks at each alone, taken here where they are not at hand; suspects beyond them are looked
+        for one after the other among those before. A scene that costs ``reached`` is known: a hypothesis whose scenes
+        all must cost more is dropped, and one that ends above it is not polished. ``asked`` are those whose boxes are
+        asked about.
         """
         if not self.looks_first:
             tracks = self._sequence(scene, suspects)
             layers = self._layers(scene, suspects, tracks)
             return self._result(scene, tracks, layers, scene_cost(scene, layers, self._settings.cost))
         begun = list(starts or self.looks(scene, suspects, among=len(suspects)))
-        draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), self._composition(scene, suspects))
-        if (bound := draft.composition.bound()) > reached:
-            return self._result(scene, begun, draft.layers, bound, dropped=True)
+        composition = self._composition(scene, suspects)
+        if (bound := composition.bound()) > reached:
+            return self._result(scene, begun, self._layers(scene, suspects[: len(begun)], begun), bound, dropped=True)
+        begun = self._found_among(scene, suspects, begun)
+        draft = _Draft(scene, suspects, begun, self._layers(scene, suspects, begun), composition)
         self._settle(draft, reached)
-        return self._result(scene, draft.tracks, draft.layers, draft.cost)
+        unexplained = draft.unexplained([_window(scene, suspect) for suspect in asked]) if asked else []
+        return replace(self._result(scene, draft.tracks, draft.layers, draft.cost), unexplained=tuple(unexplained))
 
     def begun_cost(self, scene: ObservedScene, suspects: Sequence[Suspect], starts: Sequence[Floats]) -> float:
         """What the scene of first looks costs, poses 3 x 4; estimating its hypothesis ends no higher."""
@@ -174,6 +181,18 @@ class SceneFilter:
             key = _extended(key, suspect)
             tracks.append(self._remembered(key, scene, background, suspect, share))
             background = self._added(background, scene, suspect, tracks[-1])
+        return tracks
+
+    def _found_among(self, scene: ObservedScene, suspects: Sequence[Suspect], begun: Sequence[Track]) -> list[Track]:
+        """The tracks of all suspects: those beyond the given ones are looked for among those before."""
+        tracks = list(begun)
+        key = _extended_by(self._observation_key(scene, 0), b"among")
+        for track in tracks:
+            key = _extended_by(key, track.T_camera_object.tobytes())
+        for suspect in suspects[len(begun) :]:
+            background = _composite(scene, self._layers(scene, suspects[: len(tracks)], tracks))
+            key = _extended(key, suspect)
+            tracks.append(self._run(scene, background, suspect, self._settings.iterations // len(suspects), key))
         return tracks
 
     def _remembered(
@@ -220,7 +239,7 @@ class SceneFilter:
         for number in range(first, first + self._settings.sweeps):
             if number == 1:
                 stale |= self._rescue(draft)
-            left = draft.unexplained()
+            left = draft.unexplained(draft.windows)
             stale = self._sweep(draft, {i for i in stale if left[i] > least}, number)
 
     def _sweep(self, draft: _Draft, stale: set[int], number: int) -> set[int]:
@@ -249,7 +268,7 @@ class SceneFilter:
         share = self._settings.iterations // max(1, len(keys))
         changed: set[int] = set()
         for i, suspect in enumerate(draft.suspects):
-            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained()[i] <= _LEFT:
+            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained(draft.windows)[i] <= _LEFT:
                 continue
             track = self._run(draft.scene, draft.background(i), suspect, share, keys[i])
             changed |= self._moved(draft, i, track)
@@ -315,7 +334,7 @@ class _Draft:
         self.layers = layers
         self.composition = composition
         self.cost = composition.cost(layers)
-        self._windows = [_window(scene, suspect) for suspect in suspects]
+        self.windows = [_window(scene, suspect) for suspect in suspects]
 
     def background(self, i: int) -> Float32s:
         """The plane and all objects but one."""
@@ -323,19 +342,19 @@ class _Draft:
 
     def others_reached(self, i: int) -> set[int]:
         """The objects into whose boxes the layer of object i reaches, itself among them."""
-        return {j for j, window in enumerate(self._windows) if bool((self.layers[i][window] > 0).any())}
+        return {j for j, window in enumerate(self.windows) if bool((self.layers[i][window] > 0).any())}
 
     def cost_without(self, i: int) -> float:
         """Cost of the scene without one object."""
         return self.composition.cost_without(i, self.layers)
 
-    def unexplained(self) -> list[float]:
-        """For every box the share of what stands in it that the scene does not explain."""
+    def unexplained(self, windows: Sequence[tuple[slice, slice]]) -> list[float]:
+        """For every window the share of what stands in it that the scene does not explain."""
         costs, credit = self.composition.pixels(self.layers), self.composition.credit
         return [
             float(costs[window][costs[window] > _OPEN].sum(dtype=np.float64))
             / max(float(credit[window].sum(dtype=np.float64)), 1e-6)
-            for window in self._windows
+            for window in windows
         ]
 
     def take(self, i: int, track: Track, layer: Float32s) -> bool:

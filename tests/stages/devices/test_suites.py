@@ -93,6 +93,13 @@ def test_biased_cameras_see_something_else_than_they_say() -> None:
     assert depth.shape == (480, 640) and not np.isclose(depth[240, 320], said, atol=0.003)
 
 
+def test_no_robot_is_calibrated_but_only_biased_ones_have_joints_that_are_off() -> None:
+    worlds = [World(World.Config(suite=suite, seed=0)) for suite in ("tray", "biased")]
+    shots = [run_stage(world, [Arrangement(kind="goal"), LookRequest(purpose="goal")])[1] for world in worlds]
+    assert all(abs(shot.errors.depth - 1) >= 0.01 and shot.errors.T_believed_true[0, 3] != 0 for shot in shots)
+    assert [bool(shot.errors.joints.any()) for shot in shots] == [False, True]
+
+
 def test_biased_joints_go_where_they_are_told_by_their_encoders() -> None:
     world = World(World.Config(suite="biased", seed=0))
     read = RobotCommand(times=np.zeros(0), positions=np.zeros((0, 8)), velocities=np.zeros((0, 8)))

@@ -1,0 +1,69 @@
+"""What may be wrong with the best scene so far: ways to revise it that its unexplained readings suggest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from stages.messages.digest import Offer, Posterior
+from stages.messages.scene import ObjectPose
+
+_OPEN = 0.1
+"""Share of what stands in a candidate's box from which on its object may be missing, or stand elsewhere."""
+_UNSEEN = 0.01
+"""Visible share of an object up to which it explains nothing."""
+_GAIN = 0.01
+"""Share of the cost that a round must save for another one to follow."""
+
+
+@dataclass(frozen=True)
+class Revision:
+    """Another scene: some objects of the best one stay, some offers are looked for among them."""
+
+    kept: tuple[int, ...]
+    """Indices of objects."""
+    new: tuple[int, ...]
+    """Indices of offers, in the order in which they are looked for."""
+
+
+def revisions(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
+    """Every revision of the best scene, the likelier kinds first.
+
+    An object that others hide wholly is left out; an offer comes in; it does, and an object in its way is looked for
+    again then; an object is looked for again; it is left out.
+    """
+    everything = tuple(range(len(best.objects)))
+    chosen = {_index(item, offers): i for i, item in enumerate(best.objects)}
+    without = {k: tuple(j for j in everything if j != i) for k, i in chosen.items()}
+    unseen = [k for k, i in chosen.items() if best.objects[i].visible < _UNSEEN]
+    by_share = sorted(range(len(offers)), key=lambda k: -best.unexplained[k])
+    left_open = [k for k in by_share if best.unexplained[k] > _OPEN]
+    missing = [k for k in left_open if k not in chosen]
+    doubtful = [k for k in left_open if k in chosen]
+    met = [(k, new) for k, new in product(doubtful, missing) if _meet(offers[k], offers[new])]
+    return [
+        *(Revision(without[k], ()) for k in unseen),
+        *(Revision(everything, (new,)) for new in missing),
+        *(Revision(without[k], (new, k)) for k, new in met),
+        *(Revision(without[k], (k,)) for k in doubtful),
+        *(Revision(without[k], ()) for k in doubtful),
+    ]
+
+
+def is_better(log_weight: float, known: float) -> bool:
+    """Whether a scene saves enough of what the best one before costs."""
+    return log_weight > (1 - _GAIN) * known
+
+
+def _index(item: ObjectPose, offers: Sequence[Offer]) -> int:
+    """The offer that an object comes from."""
+    return next(k for k, offer in enumerate(offers)
+                if offer.candidate.label == item.label and np.array_equal(offer.candidate.box, item.box))  # fmt: skip
+
+
+def _meet(one: Offer, other: Offer) -> bool:
+    a, b = one.candidate.box, other.candidate.box
+    return bool((np.maximum(a[:2], b[:2]) < np.minimum(a[2:], b[2:])).all())
