@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from runner.contract import Level, Message
 from stages.demonstrator import Demonstrator
-from stages.devices import tabletop
 from stages.devices.suites import kinds
 from stages.executor import Executor
 from stages.geometry import regions
@@ -43,6 +42,8 @@ from stages.messages import (
 )
 from stages.messages.digest import ObjectPose
 from stages.planner import Planner
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.scoring import label_of
 from stages.scene.truth import Judgement, Truth
@@ -92,7 +93,7 @@ class Robot:
     def __init__(self, suite: str, seed: int, *, metres: float, verbose: bool) -> None:
         self._ctx = Context(np.random.default_rng(seed), verbose)
         self._metres = metres
-        self._catalogue = Catalogue.shared(BUILT_IN)
+        self._catalogue, self._robot = Catalogue.shared(BUILT_IN), read_robot(ROBOT)
         self._world = World(World.Config(suite=suite, seed=seed))
         self._builder = SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=BUILT_IN))
         self._planner = Planner(Planner.Config(catalogue=BUILT_IN))
@@ -136,7 +137,7 @@ class Robot:
         snapshot = self._world.on_look_request(request)
         self.episode.snapshots.append(snapshot)
         assert snapshot.T_base_table is not None and snapshot.table_size is not None
-        T_base_camera = inverse(tabletop.T_camera_base())
+        T_base_camera = inverse(self._robot.T_camera_base)
         half = snapshot.table_size / 2
         objects = tuple(
             ObjectPose(

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.planning.collision import CollisionWorld, Table
+from stages.planning.collision import CollisionWorld
 from stages.planning.pick_place import Errand, PickPlacePlanner
 from stages.planning.placements import Scene
 from stages.planning.search import Step
-from stages.robots import Robot
+from stages.robots import Robot, Table
 from stages.scene.stance import Standing
 
 CLEARANCE = 0.002
