@@ -39,7 +39,7 @@ from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import Stances, standing_of
-from stages.scene.virtual import satisfied
+from stages.scene.virtual import satisfied, without
 
 
 class Phase(Enum):
@@ -72,6 +72,10 @@ class State:
     transfers: int = 0
     goal: SceneGraph | None = None
     """What is to be restored; None while it is being shown."""
+    whole: SceneGraph | None = None
+    """The goal as it was shown, while what is restored is the part of it that does without what is missing."""
+    lacking: str = ""
+    """What is missing of it, in words."""
     scene: SceneGraph | None = None
     """As it was looked at last, completed from memory."""
     known: Mapping[str, SceneObject] = field(default_factory=dict[str, SceneObject])
@@ -205,6 +209,9 @@ class Demonstrator(Stage):
             remembered=tuple(sorted(_names(scene) - _names(scene_graph))),
             looks=self._state.looks + 1,
         )
+        whole = self._state.whole
+        if whole is not None and _names(whole) <= _names(scene):
+            self._state = replace(self._state, goal=whole, whole=None, lacking="")
         missing = self._missing(scene)
         if missing:
             yield self._look_again("perception", missing, ctx)
@@ -213,7 +220,7 @@ class Demonstrator(Stage):
         else:
             yield self._compare(self._state.goal, scene, ctx)
 
-    def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
+    def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Task | Verdict | None:
         """Starts the plan's first transfer, or gives up where there is none."""
         if self._state.phase is not Phase.PLANNING:
             return None
@@ -260,13 +267,26 @@ class Demonstrator(Stage):
         suffix = f", look {self._state.repeats + 1}" if self._state.repeats else ""
         return LookRequest(purpose=purpose + suffix)
 
-    def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Verdict:
+    def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Task | Verdict:
         """One more look at the same scene (its noise is new), or the verdict once these are used up."""
         if self._state.repeats == self._config.repeats:
-            return self._fail(stage, f"{why} ({self._state.repeats + 1} looks at scene '{self._state.purpose}')", ctx)
+            why = f"{why} ({self._state.repeats + 1} looks at scene '{self._state.purpose}')"
+            missing = stage == "perception" and self._state.goal is not None
+            return self._do_without(why, ctx) if missing else self._fail(stage, why, ctx)
         self._state = replace(self._state, repeats=self._state.repeats + 1)
         ctx.log(f"{why}; looking again", level="warning")
         return self._look(self._state.purpose)
+
+    def _do_without(self, why: str, ctx: Context) -> Task | Verdict:
+        """Restores what the goal says of everything else; what is missing is named in the end."""
+        goal, scene = self._state.goal, self._state.scene
+        assert goal is not None and scene is not None
+        rest = without(goal, _names(goal) - _names(scene))
+        if not rest.objects:
+            return self._fail("perception", why, ctx)
+        ctx.log(f"{why}; restores the rest", level="warning")
+        self._state = replace(self._state, whole=self._state.whole or goal, goal=rest, lacking=why)
+        return self._compare(rest, scene, ctx)
 
     def _known_after(self, outcome: Outcome) -> Mapping[str, SceneObject]:
         """Where objects are known to be once a transfer has ended: what was let go of is where that was."""
@@ -304,6 +324,8 @@ class Demonstrator(Stage):
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
         ctx.log(f"scene '{self._state.purpose}': {count}{from_memory}")
+        if not violated and self._state.lacking:
+            return self._fail("perception", f"{self._state.lacking}; every other relation of the goal holds", ctx)
         if not violated:
             return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
         if self._state.transfers == self._config.max_transfers:
@@ -357,8 +379,9 @@ class Demonstrator(Stage):
         state = self._state
         held: tuple[Assertion, ...] = ()
         violated: tuple[Assertion, ...] = ()
-        if state.goal is not None and state.scene is not None:
-            held, violated = satisfied(state.goal, state.scene, self._catalogue)
+        goal = state.whole or state.goal
+        if goal is not None and state.scene is not None:
+            held, violated = satisfied(goal, state.scene, self._catalogue)
         self._state = replace(state, phase=Phase.DONE if self._config.scripted else Phase.IDLE)
         return Verdict(
             goal_name=state.goal_name,

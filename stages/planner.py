@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from runner.contract import Refused, Stage
+from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
 from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning import search
@@ -21,6 +21,9 @@ from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.stance import Stances
 from stages.scene.virtual import satisfied
+
+SEARCHES = 16
+"""Times that a plan is searched for, each knowing more of what is in the way."""
 
 
 class Impossible(Exception):
@@ -44,13 +47,13 @@ class Attempt:
         """
         step, problem = blocked.step, self.problem
         earlier = {before.item for before in steps[: steps.index(step)]}
-        parent = (problem.regions[step.item].parent,) if step.region else ()
-        movable = set(blocked.obstacles) <= problem.graspable
-        for names in (blocked.obstacles if movable else (), parent):
+        parent = (step.parent,) if step.region else ()
+        for names in (problem.graspable & set(blocked.obstacles), parent):
             placed = set(names) & earlier
             if placed - self.reluctant:
                 return replace(self, reluctant=self.reluctant | placed)
             added = {(name, step.item, step.destination) for name in set(names) & problem.graspable - earlier}
+            added |= {(step.item, name, problem.finally_at(name)) for name in placed - {step.destination, step.parent}}
             if added - problem.obstructions:
                 return replace(self, problem=replace(problem, obstructions=problem.obstructions | added))
         return None
@@ -77,14 +80,18 @@ class Planner(Stage):
                 raise Refused(f"planner.gripper_width={self.gripper_width}: must be a positive number of metres")
 
     def __init__(self, config: Config) -> None:
+        # Motion planning takes half a second to load; whoever only reads a graph does without.
+        from stages.planning.handling import Handling
+
         search.check_engine(config.engine)
+        self._handling = Handling
         self._config = config
         self._robot = read_robot(config.robot)
         self._widest = config.gripper_width or self._robot.gripper.widest
         self._catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
-    def on_task(self, task: Task) -> Plan:
+    def on_task(self, task: Task, ctx: Context) -> Plan:
         """A plan whose every transfer has poses, or a refusal before anything moves."""
         for scene in (task.goal, task.current):
             if scene.frame != "base":
@@ -99,7 +106,7 @@ class Planner(Stage):
             return _answer("satisfied", text)
         try:
             self._check(problem, task)
-            return self._solve_with_room(problem, task)
+            return self._solve_with_room(problem, task, ctx)
         except Impossible as reason:
             return _answer("refused", text, reason=str(reason))
 
@@ -141,7 +148,7 @@ class Planner(Stage):
             if support in problem.clear or problem.goal.get(support, TABLE) != problem.supports.get(support, TABLE):
                 raise Impossible(f"{item} on {support} would have to move, but it {why}")
 
-    def _solve_with_room(self, problem: Problem, task: Task) -> Plan:
+    def _solve_with_room(self, problem: Problem, task: Task, ctx: Context) -> Plan:
         """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
         scene = Scene.of(task.current, self._stances)
         beside = {
@@ -152,32 +159,38 @@ class Planner(Stage):
         }
         if beside:
             with suppress(Impossible):
-                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task)
-        return self._solve(problem, task)
+                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task, ctx)
+        return self._solve(problem, task, ctx)
 
-    def _solve(self, problem: Problem, task: Task) -> Plan:
+    def _solve(self, problem: Problem, task: Task, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
         current = Scene.of(task.current, self._stances)
-        targets = Targets(Placements(task.goal, self._stances), self._config.workspace, self._robot)
+        handling = self._handling(self._robot, self._robot.table, ctx.rng)
+        placements = Placements(task.goal, self._stances)
+        targets = Targets(placements, self._config.workspace.of(self._robot), handling, carriers(task.goal))
         avoided = frozenset(task.avoid)
+        because = ""
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
-        while True:
+        for _ in range(SEARCHES):
             text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
             solution = self._search(attempt, text)
             if solution.steps is None:
-                raise Impossible(_dead_end(attempt.problem, problem))
+                raise Impossible(because or _dead_end(attempt.problem, problem))
             again = [step for step in solution.steps if _key(step) in avoided]
-            poses = targets.of(solution.steps, current, carriers(task.goal), again=again, late=attempt.reluctant)
+            poses = targets.of(solution.steps, current, again=again, late=attempt.reluctant)
             if isinstance(poses, Crowded):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
                 continue
             if not isinstance(poses, Blocked):
                 transfers = [_transfer(*pair, attempt.problem) for pair in zip(solution.steps, poses, strict=True)]
                 return _answer("solved", text, transfers=transfers, expanded=solution.expanded)
+            because = _no_room(poses)
             following = attempt.after(poses, solution.steps)
             if following is None:
-                raise Impossible(_no_room(poses))
+                raise Impossible(because)
+            ctx.log(f"{because}; looks for another way")
             attempt = following
+        raise Impossible(because)
 
     def _search(self, attempt: Attempt, text: str) -> Solution:
         if self._config.engine == search.BFS:
@@ -246,6 +259,9 @@ def _dead_end(attempted: Problem, original: Problem) -> str:
 
 def _no_room(blocked: Blocked) -> str:
     step = blocked.step
+    if blocked.why:
+        among = f" ({_listed(blocked.obstacles)} in the way)" if blocked.obstacles else ""
+        return f"{step.item} cannot be taken from {step.source} to {step.destination}: {blocked.why}{among}"
     where = f"on the table for {step.item}" if step.destination == TABLE else f"for {step.item} at {step.destination}"
     because = f": {_listed(blocked.obstacles)} in the way" if blocked.obstacles else ""
     return f"no room {where} within reach{because}"

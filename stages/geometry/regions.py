@@ -102,8 +102,8 @@ def separation(a: Region, b: Region) -> float:
 def _beyond(region: Region, other: Region) -> float:
     """How far all of ``other`` lies beyond the edge of ``region`` that separates them best; negative if none does."""
     along = np.roll(region, -1, axis=0) - region
-    outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    return float(((other[:, None] - region) * outward).sum(2).min(0).max())
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
+    return float(((outward @ other.T).min(1) - (outward * region).sum(1)).max())
 
 
 def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
@@ -117,8 +117,8 @@ def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[n
 def depth(region: Region, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """How deep N points lie inside the region, metres, N: distance to the nearest edge line, negative outside."""
     along = np.roll(region, -1, axis=0) - region
-    inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-    return ((points[:, None] - region) * inward).sum(2).min(1)
+    inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
+    return (points @ inward.T - (region * inward).sum(1)).min(1)
 
 
 def inside(inner: Region, outer: Region, *, margin: float = 0.0) -> bool:

@@ -58,6 +58,7 @@ class CollisionWorld:
         clearance: float = 0.005,
     ) -> None:
         self.robot, self.carried, self.checks = robot, carried, 0
+        self.objects = {name: entry for name, (entry, _) in objects.items()}
         self._model = self._compile(table, objects)
         self._data = mujoco.MjData(self._model)
         self._index_robot()

@@ -29,6 +29,8 @@ ROTATION_TOLERANCE = 3e-3
 _DAMPING = 1e-4
 _LARGEST_STEP = 0.4
 """Radians that one joint may move in one step of inverse kinematics."""
+_PATIENCE, _PROGRESS = 10, 0.97
+"""Inverse kinematics gives up where so many steps leave more than this share of the error: out of reach."""
 _LARGEST_JUMP = 0.35
 """Radians between waypoints of a straight hand motion; more means a change of configuration."""
 _STRAIGHT_STEP = 0.01
@@ -170,8 +172,14 @@ def time_parameterise(robot: Robot, waypoints: Floats, *, speed: float = 0.7) ->
 
 def _descend(world: CollisionWorld, target: Floats, seed: Floats, iterations: int) -> Floats | None:
     q = np.clip(seed, world.lower, world.upper)
-    for _ in range(iterations):
+    least = np.inf
+    for k in range(iterations):
         error = _pose_error(world.hand(q), target)
+        if k % _PATIENCE == 0:
+            left = float(np.abs(error).max())
+            if left > _PROGRESS * least:
+                return None
+            least = left
         if np.abs(error[:3]).max() < POSITION_TOLERANCE and np.abs(error[3:]).max() < ROTATION_TOLERANCE:
             return q
         J = world.jacobian()

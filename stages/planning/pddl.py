@@ -17,9 +17,9 @@ DOMAIN = """\
 (define (domain scene)
   (:requirements :adl)
   (:types
+    thing label - object        ; a label names a pose in the robot's base frame
     support region - thing      ; the table, items, and regions attached to items
-    item - support
-    label)                      ; names a pose in the robot's base frame
+    item - support)
   (:constants table - support)
   (:predicates
     (exist ?i - item)
@@ -35,7 +35,7 @@ DOMAIN = """\
     (roomy ?s - support)                          ; may carry several items; geometry says whether one more fits
     (may-rest ?i - item ?s - support)             ; worth trying
     (belongs ?i - item ?r - region)
-    (obstructs ?o - item ?i - item ?s - support)) ; it stands where the item would come on the support
+    (obstructs ?o - item ?i - item ?t - thing))   ; it stands where the item would come on the support or in the region
 
   (:action pick
     :parameters (?i - item ?s - support)
@@ -45,7 +45,7 @@ DOMAIN = """\
       (forall (?l - label) (not (at ?i ?l)))
       (forall (?r - region) (not (in ?r ?i)))
       (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
-      (forall (?o - item ?t - support) (not (obstructs ?i ?o ?t)))))
+      (forall (?o - item ?t - thing) (not (obstructs ?i ?o ?t)))))
 
   (:action pick-from
     :parameters (?i - item ?s - item)
@@ -55,7 +55,7 @@ DOMAIN = """\
       (forall (?l - label) (not (at ?i ?l)))
       (forall (?r - region) (not (in ?r ?i)))
       (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
-      (forall (?o - item ?t - support) (not (obstructs ?i ?o ?t)))))
+      (forall (?o - item ?t - thing) (not (obstructs ?i ?o ?t)))))
 
   (:action place-on
     :parameters (?i - item ?s - support)
@@ -73,7 +73,7 @@ DOMAIN = """\
     :parameters (?i - item ?r - region ?p - item ?s - support)
     :precondition (and (holding ?i) (may-rest ?i ?s) (belongs ?i ?r) (has ?p ?r) (or (on ?p ?s) (in ?p ?s))
       (or (roomy ?s) (clear ?s))
-      (forall (?o - item) (not (obstructs ?o ?i ?s))))
+      (forall (?o - item) (and (not (obstructs ?o ?i ?s)) (not (obstructs ?o ?i ?r)))))
     :effect (and (in ?r ?i) (handempty) (not (holding ?i)) (not (clear ?s))
       (when (concave ?s) (in ?i ?s))
       (when (not (concave ?s)) (on ?i ?s)))))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice, product
 
 import numpy as np
@@ -18,7 +19,7 @@ from stages.planning.motion import free_motion, restarts, solve_ik, straight_mot
 from stages.scene.catalogue import CatalogueObject, Grasp
 
 LIFT = 0.12
-"""Metres that an object is lifted before it is carried."""
+"""Metres that an object is lifted before it is carried, or half of it where the arm cannot."""
 ABOVE = 0.10
 """Metres above its target from which an object is lowered."""
 HOVER = 0.008
@@ -28,11 +29,16 @@ ROOM = 0.012
 RELEASE = 0.010
 """Metres that each finger opens to let go."""
 
-_RESTARTS = 6
+_RESTARTS = 12
+"""Random postures from which inverse kinematics starts: near the robot, few of them lead to a free one."""
 _KEPT = 3
-"""Feasible picks and places per grasp that are paired."""
+"""Feasible picks and places per grasp that are paired, and postures at which is looked for what is in the way."""
 _TRIED = 64
 """Hand poses per grasp that are tried for the place."""
+_EXAMINED, _TURNS = 8, 8
+"""Targets that are examined before anything moves, and hand poses per grasp at each."""
+_SUSPECTED = 12
+"""Hand poses at which is looked for what is in the way."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class PickPlacePlanner:
     def __init__(self, world: CollisionWorld, errand: Errand, rng: np.random.Generator) -> None:
         self._world, self._errand, self._rng = world, errand, rng
         self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
+        self._is_picked = False
 
     def plans(self, start: Floats) -> Iterator[PickPlace]:
         """Complete plans from joint positions ``start`` (J), most preferred grasp first."""
@@ -101,6 +108,61 @@ class PickPlacePlanner:
             picks = list(islice(self._picks(grasp, start), _KEPT))
             places = list(islice(self._places(grasp, picks[0].lift[-1]), _KEPT)) if picks else []
             yield from self._connected(product(picks, places), start)
+
+    def reachable(self, start: Floats) -> Iterator[int]:
+        """Targets by number, best first, to which a grasp leads from where the object is.
+
+        Motions from ``start`` to the pick and from there to the place are not looked for: the cheap part of
+        :meth:`plans`, which all but decides.
+        """
+        pick = cache(lambda k: next(self._picks(grasps[k], start), None))
+        grasps = distinct_grasps(self._errand.entry)
+        for number, target in enumerate(self._errand.targets[:_EXAMINED]):
+            picks = (found for k in range(len(grasps)) if (found := pick(k)) is not None)
+            hands = ((hand, found) for found in picks for hand in self._hands(found.hand.grasp, target)[:_TURNS])
+            if any(self._place(hand, found.lift[-1]) is not None for hand, found in hands):
+                yield number
+            self._is_picked = any(pick(k) is not None for k in range(len(grasps)))
+            if not self._is_picked:
+                return
+
+    def in_the_way(self, start: Floats) -> tuple[str, ...]:
+        """The fewest objects that keep the hand from the pick, or from the place if there is a pick.
+
+        Empty where it is not objects that keep it from there. To be asked once :meth:`reachable` has ended.
+        """
+        poses = self._errand.targets if self._is_picked else [self._errand.T_base_object]
+        grasps = distinct_grasps(self._errand.entry)
+        hands = (hand for T in poses for grasp in grasps for hand in self._hands(grasp, T))
+        found = (self._touched(hand, start) for hand in islice(hands, _SUSPECTED))
+        return min((names for names in found if names), key=self._effort, default=())
+
+    def _effort(self, names: Sequence[str]) -> tuple[int, int]:
+        """How hard it is to clear a place: objects that nobody can move, then objects."""
+        return sum(not self._world.objects[name].grasps for name in names), len(names)
+
+    def _touched(self, hand: HandPose, start: Floats) -> tuple[str, ...]:
+        """Objects too near the hand or what it holds; none where it is not reached or something else is too near."""
+        world = self._world
+        world.set_width(opening(world, hand.grasp, ROOM))
+        placing = [self._holding(hand), world.resting(self._errand.destination)]
+        before = raised(hand.T_base_hand, ABOVE) if self._is_picked else hand.T_base_prehand
+        with ExitStack() as stack:
+            for context in placing if self._is_picked else [world.touching(world.carried)]:
+                stack.enter_context(context)
+            found = [self._near(T, start) for T in (hand.T_base_hand, before)]
+        return () if None in found else tuple(sorted(set[str]().union(*filter(None, found))))
+
+    def _near(self, T_base_hand: Floats, start: Floats) -> set[str] | None:
+        """Objects too near in the first posture in which nothing else is."""
+        for q in islice(self._postures(T_base_hand, start), _KEPT):
+            near = [self._world.objects.keys() & set(pair) for pair in self._world.contacts(q)]
+            if all(near):
+                return set[str]().union(*near)
+        return None
+
+    def _hands(self, grasp: Grasp, T_base_object: Floats) -> list[HandPose]:
+        return hand_poses(self._errand.entry, grasp, T_base_object)
 
     def _connected(self, pairs: Iterable[tuple[Pick, Place]], start: Floats) -> Iterator[PickPlace]:
         """Joins picks and places by motions in joint space."""
@@ -118,46 +180,65 @@ class PickPlacePlanner:
             yield PickPlace(pick, place, reach, carry)
 
     def _picks(self, grasp: Grasp, start: Floats) -> Iterator[Pick]:
-        for hand in hand_poses(self._errand.entry, grasp, self._errand.T_base_object):
+        for hand in self._hands(grasp, self._errand.T_base_object):
             pick = self._pick(hand, start)
             if pick is not None:
                 yield pick
 
     def _pick(self, hand: HandPose, start: Floats) -> Pick | None:
+        """The first posture before the grasp from which straight motions lead to it and up."""
         world = self._world
-        world.set_width(opening(world, hand.grasp, ROOM))
-        pregrasp = solve_ik(world, hand.T_base_prehand, seeds=restarts(world, self._rng, start, extra=_RESTARTS))
-        if pregrasp is None:
-            return self._note("ik", "no grasp of it is reachable without a collision")
-        with world.touching(world.carried):
-            approach = straight_motion(world, pregrasp, hand.T_base_hand)
-        if approach is None:
-            return self._note("pick motion", "no straight approach to a grasp")
-        with self._holding(hand), world.resting(self._errand.source):
-            lift = straight_motion(world, approach[-1], raised(hand.T_base_hand, LIFT))
-        return self._note("pick motion", "no way to lift it") if lift is None else Pick(hand, approach, lift)
+        self._note("ik", "no grasp of it is reachable without a collision")
+        for pregrasp in self._postures(hand.T_base_prehand, start):
+            world.set_width(opening(world, hand.grasp, ROOM))
+            if not world.is_free(pregrasp):
+                continue
+            with world.touching(world.carried):
+                approach = straight_motion(world, pregrasp, hand.T_base_hand)
+            if approach is None:
+                self._note("pick motion", "no straight approach to a grasp")
+                continue
+            with self._holding(hand), world.resting(self._errand.source):
+                heights = (raised(hand.T_base_hand, height) for height in (LIFT, LIFT / 2))
+                lifts = (straight_motion(world, approach[-1], T) for T in heights)
+                lift = next((found for found in lifts if found is not None), None)
+            if lift is not None:
+                return Pick(hand, approach, lift)
+            self._note("pick motion", "no way to lift it")
+        return None
+
+    def _postures(self, T_base_hand: Floats, *first: Floats) -> Iterator[Floats]:
+        """Joint positions (J) with the hand at a pose, collisions or not."""
+        for seed in restarts(self._world, self._rng, *first, extra=_RESTARTS):
+            q = solve_ik(self._world, T_base_hand, seeds=iter([seed]), free=False)
+            if q is not None:
+                yield q
 
     def _places(self, grasp: Grasp, seed: Floats) -> Iterator[Place]:
-        hands = (hand for target in self._errand.targets for hand in hand_poses(self._errand.entry, grasp, target))
+        hands = (hand for target in self._errand.targets for hand in self._hands(grasp, target))
         for hand in islice(hands, _TRIED):
             place = self._place(hand, seed)
             if place is not None:
                 yield place
 
     def _place(self, hand: HandPose, seed: Floats) -> Place | None:
+        """The first posture above the target from which straight motions lead down, and back once the hand is open."""
         world = self._world
-        above = raised(hand.T_base_hand, ABOVE)
-        with self._holding(hand):
-            q = solve_ik(world, above, seeds=restarts(world, self._rng, seed, world.robot.home, extra=_RESTARTS))
-            if q is None:
-                return self._note("place motion", "no reachable posture above the target")
-            with world.resting(self._errand.destination):
-                lower = straight_motion(world, q, raised(hand.T_base_hand, HOVER))
-        if lower is None:
-            return self._note("place motion", "no free way down to the target")
-        if self.retreat(hand, lower[-1]) is None:
-            return self._note("place motion", "no free way out after letting go")
-        return Place(hand, lower)
+        if self.obstacle[0] != "place motion":
+            self._note("place motion", "no reachable posture above the target")
+        for q in self._postures(raised(hand.T_base_hand, ABOVE), seed, world.robot.home):
+            with self._holding(hand):
+                if not world.is_free(q):
+                    continue
+                with world.resting(self._errand.destination):
+                    lower = straight_motion(world, q, raised(hand.T_base_hand, HOVER))
+            if lower is None:
+                self._note("place motion", "no free way down to the target")
+            elif self.retreat(hand, lower[-1]) is None:
+                self._note("place motion", "no free way out after letting go")
+            else:
+                return Place(hand, lower)
+        return None
 
     def retreat(self, hand: HandPose, q: Floats) -> Floats | None:
         """Motion (W x J) of the open hand from joint positions ``q`` out of a place at ``hand``."""

@@ -40,7 +40,7 @@ class Problem:
     held: frozenset[str]
     """Children that are in their region now."""
     obstructions: frozenset[tuple[str, str, str]] = frozenset()
-    """(obstacle, item, support): the obstacle must have been picked before the item is placed there."""
+    """(obstacle, item, support or region): the obstacle must have been picked before the item is placed there."""
 
     @staticmethod
     def between(current: SceneGraph, goal: SceneGraph, *, held: frozenset[str], graspable: frozenset[str]) -> Problem:
@@ -73,6 +73,10 @@ class Problem:
         Putting blocks aside on other blocks never makes a plan shorter, so no other support is needed.
         """
         return tuple(dict.fromkeys((self.goal.get(item, TABLE), TABLE)))
+
+    def finally_at(self, item: str) -> str:
+        """The region in which the item belongs, or the support that it belongs on where it has none."""
+        return self.regions[item].name if item in self.regions else self.goal.get(item, TABLE)
 
     def satisfied(self) -> bool:
         """Whether the goal holds already."""

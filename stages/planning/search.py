@@ -25,6 +25,8 @@ class Step:
     destination: str
     region: str = ""
     """The region in which the item is placed; empty for anywhere on (or in) the destination."""
+    parent: str = ""
+    """What the region belongs to."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,7 @@ def actions(step: Step, problem: Problem) -> tuple[str, str]:
     """The pick and the place of a step as ground PDDL actions of :data:`~stages.planning.pddl.DOMAIN`."""
     pick = fact("pick-from" if step.source in problem.concave else "pick", step.item, step.source)
     if step.region:
-        parent = problem.regions[step.item].parent
-        return pick, fact("place-at-region", step.item, step.region, parent, step.destination)
+        return pick, fact("place-at-region", step.item, step.region, step.parent, step.destination)
     return pick, fact("place-in" if step.destination in problem.concave else "place-on", step.item, step.destination)
 
 
@@ -118,8 +119,10 @@ class _Search:
             if any(entry[1:] == (item, destination) for entry in obstructions):
                 continue
             placed = (*supports[:at], destination, *supports[at + 1 :])
-            if self._region_on(item, destination, lifted):
-                step = Step(item, supports[at], destination, regions[item].name)
+            if self._region_on(item, destination, lifted) and not any(
+                entry[1:] == (item, regions[item].name) for entry in obstructions
+            ):
+                step = Step(item, supports[at], destination, regions[item].name, regions[item].parent)
                 yield step, (placed, held | {item}, obstructions)
             yield Step(item, supports[at], destination), (placed, held, obstructions)
 
@@ -183,5 +186,6 @@ def _steps(ground: list[tuple[str, ...]], problem: Problem) -> Iterator[Step]:
     names = {symbol(name): name for name in (TABLE, *problem.items)}
     for (_, item, source), (_, _, *where) in zip(ground[::2], ground[1::2], strict=True):
         at_region = len(where) == 3
-        region = problem.regions[names[item]].name if at_region else ""
-        yield Step(names[item], names[source], names[where[-1]], region)
+        region = problem.regions[names[item]] if at_region else None
+        beside = (region.name, region.parent) if region else ()
+        yield Step(names[item], names[source], names[where[-1]], *beside)

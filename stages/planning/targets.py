@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from math import hypot
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +18,11 @@ from stages.planning.placements import Placement, Placements, Scene
 from stages.planning.problem import TABLE
 from stages.planning.search import Step
 from stages.planning.sight import hidden_share
-from stages.robots import Gripper, Robot
-from stages.scene.catalogue import Grasp
+from stages.robots import Robot
 from stages.scene.stance import Standing
+
+if TYPE_CHECKING:  # Motion planning takes half a second to load.
+    from stages.planning.handling import Handled, Handling
 
 TOUCHING = 0.002
 """Objects whose heights overlap by less than this are above each other, metres."""
@@ -29,6 +33,10 @@ HIDDEN = 0.1
 nobody will see what stands there."""
 CROWDED = 0.08
 """Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
+FAR = 0.1
+"""Metres beyond which it does not matter how large a gap is exactly."""
+BRANCHES, TRIES = 4, 40
+"""Places of one step from which is gone on, and how many in all before each step has but one."""
 
 ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
 """Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
@@ -84,6 +92,13 @@ class Blocked:
 
     step: Step
     obstacles: tuple[str, ...]
+    why: str = ""
+    """What the hand fails at where there is room for the object."""
+
+    @property
+    def involved(self) -> set[str]:
+        """Whatever might let the step succeed if it stood elsewhere."""
+        return {self.step.item, self.step.destination, self.step.parent, *self.obstacles}
 
 
 @dataclass(frozen=True)
@@ -93,43 +108,73 @@ class Crowded:
     step: Step
 
 
-class Targets:
-    """Chooses poses for the steps of a plan, each in the scene that the steps before it leave behind."""
+Options = tuple[list[Standing], "Handled"]
+"""Places for a step's object, and those among them that the hand reaches."""
 
-    def __init__(self, placements: Placements, workspace: Workspace, robot: Robot) -> None:
-        self._placements = placements
-        self._workspace, self._gripper = workspace.of(robot), robot.gripper
+
+class Targets:
+    """Chooses poses for the steps of a plan, each in the scene that the steps before it leave behind.
+
+    Depth first: a place counts only if the hand can take the object there, and where a later step finds no place
+    because of an object that was placed before, that object's next place is tried.
+    """
+
+    def __init__(self, placements: Placements, workspace: Workspace, handling: Handling, goal: dict[str, str]) -> None:
+        """``goal`` maps the objects of the goal to what carries them."""
+        self._placements, self._workspace, self._handling, self._goal = placements, workspace, handling, goal
+        self._known: dict[Hashable, Options | Blocked] = {}
+        self._tries = TRIES
 
     def of(
-        self,
-        steps: Sequence[Step],
-        scene: Scene,
-        goal: dict[str, str],
-        *,
-        again: Iterable[Step] = (),
-        late: Collection[str] = (),
+        self, steps: Sequence[Step], scene: Scene, *, again: Collection[Step] = (), late: Collection[str] = ()
     ) -> list[Floats] | Blocked | Crowded:
-        """T_base_targets of every step, best first, N x 4 x 4 each; or the first step that should not come now.
+        """T_base_targets of every step, best first, N x 4 x 4 each; or the step that cannot come now.
 
-        ``goal`` maps the objects of the goal to what carries them. Steps ``again`` failed before with the best poses
-        and get those that come next. Items that are ``late`` already may crowd others.
+        Steps ``again`` failed before with the best poses and get those that come next. Items that are ``late``
+        already may crowd others.
         """
-        chosen: list[Floats] = []
-        repeated = set(again)
-        for k, step in enumerate(steps):
-            final = step.destination == goal.get(step.item) and not any(s.item == step.item for s in steps[k + 1 :])
-            tried = self._goal_poses(step, scene) if final else self._free_spots(step, steps[k + 1 :], scene)
-            if isinstance(tried, Blocked):
-                return tried
-            best = self._with_room(tried, step, scene)
-            best = best[self._workspace.targets :] or best if step in repeated else best
-            best = best[: self._workspace.targets]
-            pending = {after.item for after in steps[k + 1 :]} - {step.item}
-            if step.item not in late and any(_clearance(best[0], scene.standing[name]) < CROWDED for name in pending):
+        if not steps:
+            return []
+        step, *rest = steps
+        options = self._options(step, rest, scene, step in again)
+        if isinstance(options, Blocked):
+            return options
+        places, handled = options
+        failed = None
+        for number in islice(handled.places(), BRANCHES if self._tries > 0 else 1):
+            self._tries -= 1
+            if step.item not in late and self._crowds(places[number], rest, scene):
                 return Crowded(step)
-            chosen.append(np.stack([scene.T_base_table @ item.T_table_object for item in best]))
-            scene = scene.after(step.item, best[0], step.destination)
-        return chosen
+            onward = self.of(rest, scene.after(step.item, places[number], step.destination), again=again, late=late)
+            if isinstance(onward, list):
+                best = places[number:][: self._workspace.targets]
+                return [np.stack([scene.T_base_table @ item.T_table_object for item in best]), *onward]
+            failed = onward
+            if isinstance(onward, Crowded) or step.item not in onward.involved:
+                break
+        if failed is None:
+            why, obstacles = handled.why_not()
+            return Blocked(step, obstacles, why)
+        return failed
+
+    def _options(self, step: Step, rest: Sequence[Step], scene: Scene, again: bool) -> Options | Blocked:
+        """What the same step in the same scene had before, or what is found now."""
+        final = step.destination == self._goal.get(step.item) and all(later.item != step.item for later in rest)
+        pending = () if final else tuple(rest)
+        poses = tuple((item.name, item.T_table_stance.tobytes()) for item in scene.standing.values())
+        key = (step, pending, frozenset(poses), again)
+        if key not in self._known:
+            tried = self._goal_poses(step, scene) if final else self._free_spots(step, rest, scene)
+            if not isinstance(tried, Blocked):
+                places = [placement.standing for placement in sorted(tried, key=lambda placement: placement.cost)]
+                places = places[self._workspace.targets :] or places if again else places
+                tried = places, self._handling.of(step, scene, places)
+            self._known[key] = tried
+        return self._known[key]
+
+    def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
+        pending = {after.item for after in rest} - {item.name}
+        return any(_clearance(item, scene.standing[name]) < CROWDED for name in pending)
 
     def _goal_poses(self, step: Step, scene: Scene) -> list[Placement] | Blocked:
         """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle."""
@@ -230,12 +275,6 @@ class Targets:
                 spots.append(scene.rested(Standing(item.name, item.stance, T), TABLE))
         return spots
 
-    def _with_room(self, placements: Sequence[Placement], step: Step, scene: Scene) -> list[Standing]:
-        """Sorted again: a pose at which few grasps have room for the gripper comes later."""
-        others = scene.others(step.item, step.destination)
-        costs = [p.cost + 0.05 * (1 - _share_of_grasps(p.standing, others, self._gripper)) for p in placements]
-        return [placements[k].standing for k in np.argsort(costs, kind="stable")]
-
 
 def neighbours(name: str, scene: Scene) -> list[str]:
     """The objects that stand in the way of a hand that picks one, nearest first."""
@@ -257,29 +296,16 @@ def _effort(obstacles: tuple[str, ...], scene: Scene) -> tuple[int, int]:
 
 
 def _clearance(a: Standing, b: Standing) -> float:
-    """Gap between footprints, metres, negative where they overlap; infinite where one is above the other."""
-    apart = a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING
-    return np.inf if apart else regions.separation(a.outline, b.outline)
+    """Gap between footprints, metres, negative where they overlap; infinite where one is above the other.
+
+    Of what is far apart the gap between the circles around the footprints, which is less.
+    """
+    if a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING:
+        return np.inf
+    between = hypot(*(a.T_table_stance[:2, 3] - b.T_table_stance[:2, 3])) - a.stance.radius - b.stance.radius
+    return between if between > FAR else regions.separation(a.outline, b.outline)
 
 
 def _hidden(item: Standing, others: Sequence[Standing], scene: Scene) -> float:
     """What it costs that the camera does not see an object at a place, metres."""
     return 0.0 if scene.eye is None else HIDDEN * hidden_share(item, others, scene.eye)
-
-
-def _share_of_grasps(item: Standing, others: Sequence[Standing], gripper: Gripper) -> float:
-    """Share of the object's grasps at which the open gripper touches nothing else."""
-    grasps = item.stance.item.grasps
-    room = gripper.length + gripper.finger
-    near = [other for other in others if regions.separation(item.outline, other.outline) < room]
-    return sum(_hand_fits(grasp, item, near, gripper) for grasp in grasps) / max(1, len(grasps))
-
-
-def _hand_fits(grasp: Grasp, item: Standing, others: Sequence[Standing], gripper: Gripper) -> bool:
-    half, length, thickness = grasp.width / 2 + gripper.finger, gripper.length, gripper.thickness
-    corners = [[x, y, z, 1.0] for x in (-length, 0.0) for y in (-half, half) for z in (-thickness / 2, thickness / 2)]
-    points = np.array(corners) @ (item.T_table_object @ grasp.T_object_grasp).T
-    outline = regions.hull(points[:, :2])
-    low, high = points[:, 2].min(), points[:, 2].max()
-    level = [other for other in others if other.z_bottom < high and other.z_top > low]
-    return all(regions.separation(outline, other.outline) > 0 for other in level)

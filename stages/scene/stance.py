@@ -84,6 +84,11 @@ class Stance:
         return regions.hull(self.vertices[:, :2])
 
     @cached_property
+    def radius(self) -> float:
+        """Of the circle about the origin that encloses the outline, metres."""
+        return float(np.linalg.norm(self.outline, axis=1).max())
+
+    @cached_property
     def bottom(self) -> Region:
         """r_b: the bottom surface; all of a leaning object, which has no bottom."""
         return self._slab(self.vertices[:, 2] <= self.low + SLAB * self.height) if self.aligned else self.outline

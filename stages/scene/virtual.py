@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import msgspec
 import numpy as np
 
 from stages.geometry import regions
@@ -104,6 +105,24 @@ def in_region(virtual: VirtualObject, T_base_parent: Floats, T_base_child: Float
     """Whether the child stands within the region's radius, horizontally, of one of the region's poses."""
     centres = region_poses(virtual, T_base_parent, symmetries)[:, :2, 3]
     return bool(np.linalg.norm(centres - T_base_child[:2, 3], axis=1).min() <= virtual.radius)
+
+
+def without(goal: SceneGraph, names: set[str]) -> SceneGraph:
+    """The part of a goal that does without some of its objects, what rests on or in these and regions beside them."""
+    gone = set(names)
+    while more := {
+        item.arguments[0]
+        for item in goal.assertions
+        if item.predicate in ("on", "in") and item.arguments[1] in gone and item.arguments[0] not in gone
+    } & {item.name for item in goal.objects}:
+        gone |= more
+    gone |= {item.name for item in goal.virtual_objects if not gone.isdisjoint((item.parent, item.child))}
+    return msgspec.structs.replace(
+        goal,
+        objects=tuple(item for item in goal.objects if item.name not in gone),
+        virtual_objects=tuple(item for item in goal.virtual_objects if item.name not in gone),
+        assertions=tuple(item for item in goal.assertions if gone.isdisjoint(item.arguments)),
+    )
 
 
 def satisfied(

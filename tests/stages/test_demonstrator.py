@@ -28,6 +28,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.task import STOPPED
+from stages.scene.virtual import without
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout
 from tests.stages.perception.scenes import K, camera, render, upright
@@ -216,11 +217,27 @@ def test_an_object_that_is_not_seen_is_looked_for_then_named() -> None:
     episode = Episode(repeats=1)
     episode.until_transfer()
     episode.ended(1, STEP)
-    without_cup = scene({"tray": "table", "soup_can": "table"})
+    without_cup = without(GOAL, {"cup"})
     assert episode.seen(without_cup) == [LookRequest(purpose="after transfer 1, look 2")]
     verdict = the_verdict(episode.seen(without_cup))
     assert verdict.failed_stage == "perception" and "not seen: cup" in verdict.reason
     assert "exist(cup)" in [str(item) for item in verdict.violated]
+
+
+def test_everything_but_a_missing_object_is_restored() -> None:
+    """The cup is missing; the can, which belongs on the box, is put there all the same, and the cup is named."""
+    goal = scene({"tray": "table", "cup": "tray", "tea_box": "table", "soup_can": "tea_box"})
+    found = {"tray": "table", "tea_box": "table", "soup_can": "table"}
+    step = transfer("soup_can", "table", "tea_box")
+    episode = Episode(repeats=0)
+    task = episode.until_task(goal, scene(found))
+    assert [item.name for item in task.goal.objects] == ["tray", "tea_box", "soup_can"]
+    episode.planned(step)
+    episode.ended(1, step)
+    verdict = the_verdict(episode.seen(scene({**found, "soup_can": "tea_box"})))
+    assert verdict.failed_stage == "perception" and "not seen: cup" in verdict.reason
+    assert "exist(cup)" in [str(item) for item in verdict.violated]
+    assert "on(soup_can, tea_box)" in [str(item) for item in verdict.satisfied]
 
 
 def test_an_object_found_on_the_second_look_goes_on() -> None:

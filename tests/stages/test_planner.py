@@ -18,6 +18,7 @@ from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
 from stages.scene.stance import Standing, yawed
 from stages.scene.virtual import satisfied
+from tests.stages.episodes import Recorded
 from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
 from tests.stages.planning.scenes import ROBOT
 
@@ -29,7 +30,7 @@ def planner() -> Planner:
 
 def plan(goal: Layout, current: Layout, *, avoid: tuple[str, ...] = (), surface: regions.Region | None = None) -> Plan:
     scene = msgspec.structs.replace(current.graph(), support=surface)
-    return planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=scene, avoid=avoid))
+    return planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=scene, avoid=avoid), Recorded())
 
 
 def executed(current: Layout, found: Plan, *, which: int = 0) -> Layout:
@@ -190,11 +191,28 @@ def test_nothing_is_placed_beside_what_is_still_to_be_picked():
     assert [transfer.object for transfer in plan(crowded_goal(), start).transfers] == ["tea_box", "water_bottle"]
 
 
-def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
+def test_a_neighbour_that_keeps_the_hand_away_is_put_aside_first():
+    """The bottle is where it belongs, and so near that no grasp of the tea box has room."""
     stuck = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", -0.08, -0.1)
-    assert [transfer.object for transfer in plan(crowded_goal(), stuck).transfers] == ["tea_box"]
-    again = plan(crowded_goal(), stuck, avoid=("tea_box: table -> tray",))
-    assert [transfer.object for transfer in again.transfers][:2] == ["water_bottle", "tea_box"]
+    found = plan(crowded_goal(), stuck)
+    assert [transfer.object for transfer in found.transfers] == ["water_bottle", "tea_box", "water_bottle"]
+    assert reached(crowded_goal(), executed(stuck, found))
+
+
+def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
+    near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
+    assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]
+    again = [transfer.key for transfer in plan(crowded_goal(), near, avoid=("tea_box: table -> tray",)).transfers]
+    assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
+
+
+def test_what_the_hand_cannot_reach_is_refused_with_object_and_reason():
+    goal = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box")
+    found = plan(goal, Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0.6, 0.4))
+    assert (found.status, found.transfers) == ("refused", ())
+    assert found.reason == (
+        "soup_can cannot be taken from table to tea_box: no grasp of it is reachable without a collision"
+    )
 
 
 def test_a_transfer_that_failed_gets_other_targets():
@@ -208,7 +226,7 @@ SPOTS = [(-0.1, 0.3), (-0.1, -0.3), (0.05, 0.3), (0.05, -0.3), (-0.1, 0.0)]
 
 
 @given(st.permutations(SPOTS), st.lists(st.floats(-np.pi, np.pi), min_size=5, max_size=5))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 def test_random_starts_are_solved_without_overlap(spots: list[tuple[float, float]], yaws: list[float]):
     start = Layout().put("tray", 0.12, 0.0, yaw=np.pi / 2)
     names = ["bowl", "cup", "tea_box", "tuna_can", "soup_can"]
@@ -263,7 +281,7 @@ def test_what_is_wider_than_the_gripper_is_refused():
         Layout().put("tea_box", 0, 0).put("soup_can", 0, 0, on="tea_box"),
         Layout().put("tea_box", 0, 0).put("soup_can", 0, 0.3),
     )
-    found = narrow.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()))
+    found = narrow.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()), Recorded())
     assert (
         found.reason
         == "soup_can would have to move from table to tea_box, but it is 6.8 cm wide and the gripper takes 6.0 cm"
@@ -278,7 +296,7 @@ def test_objects_that_rest_on_each_other_in_the_goal_are_refused():
     )
     goal = type(goal)(**{**{n: getattr(goal, n) for n in goal.__struct_fields__}, "assertions": circular})
     start = Layout().put("tea_box", 0, 0).put("sponge", 0, 0.3).graph()
-    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start))
+    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start), Recorded())
     assert found.reason == "in the goal tea_box, sponge rest on each other in a circle"
 
 
@@ -286,7 +304,7 @@ def test_without_room_within_reach_the_task_is_refused():
     cramped = Planner(Planner.Config(catalogue=CATALOGUE, workspace=Workspace(x=(0.59, 0.61), y=(-0.01, 0.01))))
     goal = Layout().put("tea_box", 0, 0).put("tuna_can", 0, 0, on="tea_box")
     start = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box").put("tuna_can", 0.1, 0.2)
-    found = cramped.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()))
+    found = cramped.on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()), Recorded())
     assert found.reason == "no room on the table for soup_can within reach"
 
 
@@ -294,7 +312,7 @@ def test_without_room_within_reach_the_task_is_refused():
 def test_a_scene_of_a_camera_that_does_not_know_where_it_is_is_no_place_to_move_in(unknown: str):
     scenes = {"goal": breakfast().graph(), "current": START.graph()}
     scenes[unknown] = msgspec.structs.replace(scenes[unknown], T_base_camera=None, name="photo")
-    found = planner().on_task(Task(goal_name="goal", **scenes))
+    found = planner().on_task(Task(goal_name="goal", **scenes), Recorded())
     assert found.status == "refused" and not found.transfers
     assert "scene 'photo'" in found.reason and "camera's pose" in found.reason
 
@@ -334,7 +352,7 @@ def test_an_object_stands_wholly_on_what_carries_it_with_a_margin(upper: str):
         assert middle >= 0.01 if wide else regions.inside(item.bottom, carrier.top, margin=Workspace().clearance)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.tuples(st.floats(-0.15, 0.02), st.floats(-0.4, -0.15)), st.floats(0.15, 0.4), st.floats(-0.6, 0.6),
     st.sampled_from(["water_bottle", "sauce_bottle", "mug", "tea_box"]), st.tuples(st.floats(-3.2, 3.2), st.booleans()),

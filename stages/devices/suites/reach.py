@@ -53,4 +53,8 @@ def _reaches(world: CollisionWorld, hand: HandPose) -> bool:
     q = solve_ik(
         world, hand.T_base_hand, seeds=restarts(world, np.random.default_rng(0), home, extra=_POSTURES), free=True
     )
-    return q is not None and solve_ik(world, raised(hand.T_base_hand, LIFT), seeds=iter([q])) is not None
+    if q is None or solve_ik(world, raised(hand.T_base_hand, LIFT), seeds=iter([q])) is None:
+        return False
+    # The wall of what the object stands in may fit between it and an open finger.
+    world.set_width(hand.grasp.width)
+    return world.is_free(q)
