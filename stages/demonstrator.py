@@ -22,6 +22,7 @@ from stages.messages import (
     Observation,
     Outcome,
     Plan,
+    Recover,
     Restore,
     RobotState,
     SceneGraph,
@@ -49,6 +50,7 @@ class Phase(Enum):
     LOOKING = "a scene graph"
     PLANNING = "a plan"
     TRANSFERRING = "the outcome of a transfer"
+    RECOVERING = "the arm to come home"
     IDLE = "a command"
     DONE = "nothing more"
 
@@ -88,6 +90,8 @@ class State:
     """Why the newest transfer failed; empty where it reached its relation."""
     stopping: bool = False
     """Somebody asked to stop: what is waited for is the last."""
+    halted: bool = False
+    """The arm stands where it was stopped."""
 
 
 class Demonstrator(Stage):
@@ -148,18 +152,18 @@ class Demonstrator(Stage):
             ctx.log(f'the person lays out the goal "{self._config.goal_name}"')
         return Arrangement(kind="goal")
 
-    def on_teach(self, teach: Teach, ctx: Context) -> LookRequest:
+    def on_teach(self, teach: Teach, ctx: Context) -> LookRequest | Recover:
         """Looks at what is to be remembered."""
         _refuse_odd_name(f"name={teach.name!r}", teach.name)
         self._begin(teach.name, None)
         ctx.log(f'looks at the goal "{teach.name}"')
-        return self._look(f"goal {teach.name}")
+        return self._first_look(f"goal {teach.name}")
 
-    def on_restore(self, restore: Restore, ctx: Context) -> LookRequest:
+    def on_restore(self, restore: Restore, ctx: Context) -> LookRequest | Recover:
         """Looks at what there is to do for a goal."""
         self._begin(restore.name, self._goal(restore.name))
         ctx.log(f'restores the goal "{restore.name}"')
-        return self._look(f"restore {restore.name}")
+        return self._first_look(f"restore {restore.name}")
 
     def on_forget(self, forget: Forget, ctx: Context) -> None:
         """Strikes a goal off; one that is being restored still is."""
@@ -168,11 +172,11 @@ class Demonstrator(Stage):
         self._state = replace(self._state, goals=goals)
         ctx.log(f'goal "{forget.name}" forgotten')
 
-    def on_look(self, look: Look, ctx: Context) -> LookRequest:
+    def on_look(self, look: Look, ctx: Context) -> LookRequest | Recover:
         """Looks without a goal."""
         self._begin("", None)
         ctx.log("looks at what is there")
-        return self._look("look")
+        return self._first_look("look")
 
     def on_stop(self, stop: Stop, ctx: Context) -> None:
         """Lets what is under way come to its end, and nothing follow it."""
@@ -229,11 +233,16 @@ class Demonstrator(Stage):
         return self._look_again("planner", plan.reason, ctx)
 
     def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
-        """Looks at what the transfer did, whether it claims success or not."""
+        """Looks at what the transfer did, whatever the hand has felt."""
+        if outcome.failed_stage == STOPPED and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
+            self._state = replace(self._state, halted=True)
+            return self._conclude(STOPPED, outcome.reason, ctx)
+        if self._state.phase is Phase.RECOVERING:
+            return self._recovered(outcome, ctx)
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
             return None
         complaint = "" if outcome.success else f"{outcome.failed_stage}: {outcome.reason}"
-        how = "done" if outcome.success else f"failed at {complaint}"
+        how = "felt to stand, to be seen" if outcome.success else f"failed at {complaint}"
         ctx.log(
             f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
             level="info" if outcome.success else "warning",
@@ -242,6 +251,13 @@ class Demonstrator(Stage):
             return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
+
+    def _recovered(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict:
+        """The arm is at home again, or not."""
+        if outcome.success:
+            self._state = replace(self._state, halted=False)
+            return self._look(self._state.purpose)
+        return self._fail("executor", outcome.reason, ctx)
 
     def _goal(self, name: str) -> SceneGraph:
         goals = self._state.goals
@@ -253,7 +269,14 @@ class Demonstrator(Stage):
         """Starts from anew with a goal, or with one that is yet to be seen."""
         if self._state.phase is not Phase.IDLE:
             raise Refused(f"busy: waits for {self._state.phase.value}; ask again after the verdict")
-        self._state = State(goals=self._state.goals, goal_name=name, goal=goal)
+        self._state = State(goals=self._state.goals, goal_name=name, goal=goal, halted=self._state.halted)
+
+    def _first_look(self, purpose: str) -> LookRequest | Recover:
+        """Looks, once the arm is out of the way."""
+        if not self._state.halted:
+            return self._look(purpose)
+        self._state = replace(self._state, phase=Phase.RECOVERING, purpose=purpose)
+        return Recover()
 
     def _look(self, purpose: str) -> LookRequest:
         self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
@@ -299,7 +322,7 @@ class Demonstrator(Stage):
 
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
-        self._check_transfer(scene)
+        self._check_transfer(scene, ctx)
         held, violated = satisfied(goal, scene, self._catalogue)
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
@@ -312,14 +335,23 @@ class Demonstrator(Stage):
         self._state = replace(self._state, phase=Phase.PLANNING)
         return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided())
 
-    def _check_transfer(self, scene: SceneGraph) -> None:
-        """Compares the scene with what the newest transfer promised; one that failed stays in the plan."""
+    def _check_transfer(self, scene: SceneGraph, ctx: Context) -> None:
+        """Compares the scene with what the newest transfer promised; one that failed stays in the plan.
+
+        Done is what was felt to stand and is then seen there; what the hand did not feel the look decides.
+        """
         state = self._state
         if state.transfer is None:
             return
         transfer, complaint = state.transfer, state.complaint
+        seen = transfer.object not in state.remembered
+        if complaint.startswith("unknown") and seen and _reached(transfer, scene):
+            complaint = ""
         if not complaint and not _reached(transfer, scene):
             complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
+        if not complaint:
+            done = "done" if seen else "unknown: felt to stand, hidden from here"
+            ctx.log(f"transfer {state.transfers}, {transfer.object} to {transfer.destination}: {done}")
         if complaint:
             state = replace(state, remainder=(transfer, *state.remainder), failures=(*state.failures, transfer.key))
         self._state = replace(state, transfer=None, complaint=complaint)
@@ -376,7 +408,7 @@ class Demonstrator(Stage):
 class AskedDemonstrator(Demonstrator):
     """Does what a device is asked from outside as well as what is called."""
 
-    def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Verdict:
+    def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Recover | Verdict:
         """Teaches or restores; what cannot be done is a verdict, for somebody waits for one."""
         try:
             if asked.kind == "teach":

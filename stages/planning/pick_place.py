@@ -110,7 +110,7 @@ class PickPlacePlanner:
             if reach is None:
                 self._note("pick motion", "no free motion to the pre-grasp")
                 continue
-            with self._holding(pick.hand):
+            with self.holding(pick.hand):
                 carry = free_motion(self._world, pick.lift[-1], place.lower[0], self._rng)
             if carry is None:
                 self._note("place motion", "no free motion that carries it to the target")
@@ -133,7 +133,7 @@ class PickPlacePlanner:
             approach = straight_motion(world, pregrasp, hand.T_base_hand)
         if approach is None:
             return self._note("pick motion", "no straight approach to a grasp")
-        with self._holding(hand), world.resting(self._errand.source):
+        with self.holding(hand), world.resting(self._errand.source):
             lift = straight_motion(world, approach[-1], raised(hand.T_base_hand, LIFT))
         return self._note("pick motion", "no way to lift it") if lift is None else Pick(hand, approach, lift)
 
@@ -147,7 +147,7 @@ class PickPlacePlanner:
     def _place(self, hand: HandPose, seed: Floats) -> Place | None:
         world = self._world
         above = raised(hand.T_base_hand, ABOVE)
-        with self._holding(hand):
+        with self.holding(hand):
             q = solve_ik(world, above, seeds=restarts(world, self._rng, seed, world.robot.home, extra=_RESTARTS))
             if q is None:
                 return self._note("place motion", "no reachable posture above the target")
@@ -166,7 +166,8 @@ class PickPlacePlanner:
         with self._world.touching(self._world.carried):
             return straight_motion(self._world, q, backwards)
 
-    def _holding(self, hand: HandPose) -> AbstractContextManager[None]:
+    def holding(self, hand: HandPose) -> AbstractContextManager[None]:
+        """While it lasts, the object is in the hand as at ``hand``."""
         return self._world.holding(inverse(hand.T_object_hand), hand.grasp.width)
 
     def _note(self, stage: FailedStage, reason: str) -> None:

@@ -17,6 +17,7 @@ from stages.messages import (
     Look,
     LookRequest,
     Observation,
+    Recover,
     Restore,
     RobotState,
     SceneGraph,
@@ -438,3 +439,27 @@ def test_says_how_a_plan_changed(before: str, after: str, change: str) -> None:
 def test_refuses_bad_settings(bad: dict[str, object]) -> None:
     with pytest.raises(Refused, match=rf"demonstrator\.{next(iter(bad))}="):
         Demonstrator.Config(catalogue=CATALOGUE, **bad)  # type: ignore[arg-type]
+
+
+def test_after_the_arm_was_stopped_it_comes_home_before_the_next_look() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    episode.called(Restore(name="tea"))
+    episode.seen(START)
+    episode.planned(STEP)
+    verdict = the_verdict(episode.ended(1, STEP, failed_stage=STOPPED, reason="stopped, as asked; in the hand: cup"))
+    assert (verdict.success, verdict.failed_stage) == (False, STOPPED)
+    assert verdict.reason == "stopped, as asked; in the hand: cup"
+    assert episode.called(Restore(name="tea")) == [Recover()]
+    assert episode.ended(0, STEP) == [LookRequest(purpose="restore tea")]
+    episode.seen(GOAL)
+    assert episode.called(Look()) == [LookRequest(purpose="look")]
+
+
+def test_what_the_hand_did_not_feel_the_look_decides() -> None:
+    episode = Episode()
+    episode.until_task()
+    episode.planned(STEP)
+    episode.ended(1, STEP, failed_stage="unknown", reason="nothing was felt below cup where it was let go of")
+    assert the_verdict(episode.seen(GOAL)).success

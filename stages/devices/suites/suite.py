@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.tabletop import HIDDEN, TABLE, Layout
 from stages.messages import SensorErrors
@@ -26,6 +29,9 @@ class Suite(ABC):
     """All objects that any scene has; a scene may do without some."""
     table = TABLE
 
+    factors: Mapping[str, Factors] = MappingProxyType({})
+    """Objects that are not as the catalogue has them."""
+
     @abstractmethod
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """One draw of a scene.
@@ -37,6 +43,13 @@ class Suite(ABC):
     def errors(self, rng: np.random.Generator) -> SensorErrors | None:
         """What is wrong with camera and encoders at one look; None where nothing is."""
         return None
+
+    def meddle(self, simulation: Simulation, seconds: float) -> str:
+        """Called after every ``seconds`` in which the robot moves or looks; says in words what has happened, if it has.
+
+        Begins with the start scene.
+        """
+        return ""
 
 
 class Drawn(Suite):
