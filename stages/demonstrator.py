@@ -36,7 +36,9 @@ from stages.messages import (
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
+from stages.planning.hiding import hiders
 from stages.planning.pddl import goal_pddl
+from stages.planning.placements import Scene
 from stages.scene.catalogue import Catalogue
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import Stances, standing_of
@@ -88,6 +90,10 @@ class State:
     """Key of every transfer that failed or missed its relation, in order."""
     complaint: str = ""
     """Why the newest transfer failed; empty where it reached its relation."""
+    missing: str = ""
+    """What is looked for by putting things aside, in words."""
+    searched: tuple[str, ...] = ()
+    """What was put aside, or could not be, since something was found."""
     stopping: bool = False
     """Somebody asked to stop: what is waited for is the last."""
     halted: bool = False
@@ -211,21 +217,26 @@ class Demonstrator(Stage):
         )
         missing = self._missing(scene)
         if missing:
-            yield self._look_again("perception", missing, ctx)
+            yield self._look_for(missing, scene, ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
         else:
             yield self._compare(self._state.goal, scene, ctx)
 
-    def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
+    def on_plan(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Task | Verdict | None:
         """Starts the plan's first transfer, or gives up where there is none."""
         if self._state.phase is not Phase.PLANNING:
             return None
         if self._state.stopping:
             return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
-        if plan.status == "solved":
-            return self._proceed(plan, ctx)
+        return self._proceed(plan, ctx) if plan.status == "solved" else self._without_plan(plan, ctx)
+
+    def _without_plan(self, plan: Plan, ctx: Context) -> LookRequest | Task | Verdict:
+        """Looks again, or behind something else."""
+        if self._state.missing and self._state.scene is not None:
+            ctx.log(plan.reason, level="warning")
+            return self._look_for(self._state.missing, self._state.scene, ctx)
         if plan.status == "satisfied":
             return self._look_again("planner", "the planner finds nothing to do, yet relations are violated", ctx)
         if self._state.failures:
@@ -278,6 +289,27 @@ class Demonstrator(Stage):
         self._state = replace(self._state, phase=Phase.RECOVERING, purpose=purpose)
         return Recover()
 
+    def _look_for(self, missing: str, scene: SceneGraph, ctx: Context) -> LookRequest | Task | Verdict:
+        """One more look; after that, what may hide what is missing is put aside."""
+        state = self._state
+        if state.goal is None or state.repeats == 0 or state.transfers == self._config.max_transfers:
+            return self._look_again("perception", missing, ctx)
+        hidden = [name for name in self._hiders(scene, state.goal) if name not in state.searched]
+        if not hidden:
+            return self._look_again("perception", missing, ctx)
+        ctx.log(f"{missing}; looks behind and under {hidden[0]}")
+        self._state = replace(
+            state, phase=Phase.PLANNING, searched=(*state.searched, hidden[0]), transfer=None, missing=missing
+        )
+        return Task(goal_name=state.goal_name, goal=state.goal, current=scene, aside=hidden[0])
+
+    def _hiders(self, scene: SceneGraph, goal: SceneGraph) -> list[str]:
+        missing = [self._stances[item.label] for item in goal.objects if item.name not in _names(scene)]
+        movable = {item.name for item in scene.objects if self._catalogue[item.label].grasps}
+        perceived = standing_of(scene.objects, self._stances, scene.T_base_table)
+        heights = {item.name: item.z_bottom for item in perceived}
+        return hiders(missing, Scene.of(scene, self._stances), movable, heights)
+
     def _look(self, purpose: str) -> LookRequest:
         self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
         suffix = f", look {self._state.repeats + 1}" if self._state.repeats else ""
@@ -323,6 +355,7 @@ class Demonstrator(Stage):
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
         self._check_transfer(scene, ctx)
+        self._state = replace(self._state, missing="", searched=())
         held, violated = satisfied(goal, scene, self._catalogue)
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
@@ -364,7 +397,7 @@ class Demonstrator(Stage):
         """Requests the first transfer of a solved plan, unless plans have been replaced too often."""
         state = self._state
         assert state.scene is not None  # A plan answers a task, and a task holds a scene.
-        change = "new" if state.plans == 1 else change_of_plan(state.remainder, plan.transfers)
+        change = "new" if state.plans == 1 or state.missing else change_of_plan(state.remainder, plan.transfers)
         steps = ", ".join(f"{transfer.object} to {transfer.destination}" for transfer in plan.transfers)
         ctx.log(f"plan {state.plans} ({change}): {steps}")
         replans = state.replans + (change == "replaced")

@@ -36,6 +36,8 @@ class Task(Message, frozen=True, kw_only=True):
     current: SceneGraph
     avoid: tuple[str, ...] = ()
     """Transfers that failed and should not be tried the same way again (``Transfer.key``)."""
+    aside: str = ""
+    """An object to be put elsewhere first, to see what it hides; nothing else is asked for then."""
 
 
 class Transfer(Struct, frozen=True, kw_only=True):

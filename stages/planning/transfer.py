@@ -43,6 +43,8 @@ _FAST, _SLOW = 0.7, 0.4
 _LOWERING_STEP = 0.002
 _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
+_EARLY = 0.025
+"""Metres above the target from which on a touch, while an object is lowered, is its support."""
 _CONTACT = 0.001
 """Metres that the hand must lag behind while it is lowered to count as contact."""
 _TOUCH = 3.0
@@ -245,8 +247,15 @@ class TransferRoutine:
 
     def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard | None) -> Steps:
         world = at.world
-        state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
-        q, felt = yield from self._lower_until_contact(world, state, place)
+        try:
+            state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
+            q, felt = yield from self._lower_until_contact(world, state, place)
+        except _BrokenOff as broken:
+            # What is held by its rim hangs lower than it was lifted.
+            state, q, felt = broken.state, self._arm(broken.state), True
+            height = world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3]
+            if state.stopped != "touch" or height > _EARLY:
+                raise
         held, wanted = state.gripper_width, state.gripper_width + 2 * RELEASE
         state = yield from self._do(f"let go of {world.carried}", width=wanted)
         self.in_hand = ""
