@@ -11,8 +11,8 @@ from stages.devices.suites.wild import FIXED
 
 _OFF = 0.5
 """Share by which friction and mass are off, at most."""
-_FALLS = 0.4
-"""Share of the lifts after which the object falls."""
+_FALLS, _MOST = 0.35, 3
+"""Share of the lifts after which the object falls, and how often that happens at most."""
 _AFTER = (0.3, 1.5)
 """Seconds in the hand after which it does: 1 to 6 cm above what it stood on."""
 _GREASY, _WHILE = 0.01, 0.4
@@ -28,7 +28,7 @@ class Slippery(Drawn):
         self.names = (*fixed, *rng.permutation(graspable(self.catalogue)).tolist()[: int(rng.integers(5, 8))])
         off = rng.uniform(1 - _OFF, 1 + _OFF, (len(self.names), 2)).tolist()
         self.factors = {name: Factors(*each) for name, each in zip(self.names, off, strict=True)}
-        self._rng = rng
+        self._rng, self._fallen = rng, 0
         self._held, self._falls_in, self._grips_in = "", np.inf, np.inf
 
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
@@ -45,10 +45,12 @@ class Slippery(Drawn):
             simulation.slide(1.0)
         held = simulation.held()
         if held and not self._held:
-            self._falls_in = self._rng.uniform(*_AFTER) if self._rng.random() < _FALLS else np.inf
+            falls = self._rng.random() < _FALLS and self._fallen < _MOST
+            self._falls_in = float(self._rng.uniform(*_AFTER)) if falls else np.inf
         self._held = held
         if not held or self._falls_in > 0:
             return ""
         self._falls_in, self._grips_in = np.inf, _WHILE
+        self._fallen += 1
         simulation.slide(_GREASY)
         return f"{held} falls from the hand"

@@ -181,6 +181,6 @@ def test_slippery_objects_are_not_as_the_catalogue_has_them_and_fall_from_the_ha
             self.pads.append(factor)
 
     hands = [Hand() for _ in range(20)]
-    said = [{world.meddle(hand, PIECE) for _ in range(40)} for hand in hands]
+    said = [{world.meddle(hand, PIECE) for _ in range(60)} for hand in hands]
     assert {"cup falls from the hand"} < set.union(*said)
-    assert 2 < sum(hand.pads == [0.01, 1.0] for hand in hands) < 18
+    assert sum(hand.pads == [0.01, 1.0] for hand in hands) == 3
