@@ -70,6 +70,10 @@ class Drawn(Suite):
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """Puts the objects of a scene down; raises :class:`Rejected` where there is no room."""
 
+    def stubborn(self, kind: Kind) -> set[str]:
+        """Objects for which there need be no grasp."""
+        return set()
+
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """Puts a draft together and tests whether the robot could take it apart."""
         # Motion planning takes half a second to load; whoever only reads a graph does without.
@@ -77,7 +81,7 @@ class Drawn(Suite):
 
         draft = Draft(self.catalogue, self._shapes, rng, self.table, self.hidden[kind])
         self.draw(kind, draft, rng)
-        if stuck(draft.placed, draft.supports, self.table):
+        if stuck(draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
         return draft.layout
 
