@@ -386,7 +386,9 @@ class Demonstrator(Stage):
             done = "done" if seen else "unknown: felt to stand, hidden from here"
             ctx.log(f"transfer {state.transfers}, {transfer.object} to {transfer.destination}: {done}")
         if complaint:
-            state = replace(state, remainder=(transfer, *state.remainder), failures=(*state.failures, transfer.key))
+            # What slips from the hand is tried again: nothing is wrong with where it was to go.
+            failures = state.failures if complaint.startswith("slip") else (*state.failures, transfer.key)
+            state = replace(state, remainder=(transfer, *state.remainder), failures=failures)
         self._state = replace(state, transfer=None, complaint=complaint)
 
     def _avoided(self) -> tuple[str, ...]:

@@ -486,3 +486,13 @@ def test_what_may_hide_a_missing_object_is_put_aside_before_it_is_given_up() -> 
     assert episode.seen(seen, view(start)) == [LookRequest(purpose="after transfer 1, look 3")]
     verdict = the_verdict(episode.seen(seen, view(start)))
     assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
+
+
+def test_what_slipped_is_tried_again_as_it_was() -> None:
+    episode = Episode()
+    task = episode.until_task()
+    for number in (1, 2, 3):
+        episode.planned(STEP)
+        episode.ended(number, STEP, failed_stage="slip", reason="the fingers are 2 mm apart on the way to lift cup")
+        (task,) = episode.seen(START)
+        assert isinstance(task, Task) and task.avoid == ()
