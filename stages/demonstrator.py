@@ -245,9 +245,11 @@ class Demonstrator(Stage):
 
     def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
         """Looks at what the transfer did, whatever the hand has felt."""
-        if outcome.failed_stage == STOPPED and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
+        stands = outcome.failed_stage == STOPPED or outcome.held
+        if stands and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
             self._state = replace(self._state, halted=True)
-            return self._conclude(STOPPED, outcome.reason, ctx)
+            stage = STOPPED if outcome.failed_stage == STOPPED else "executor"
+            return self._conclude(stage, outcome.reason, ctx)
         if self._state.phase is Phase.RECOVERING:
             return self._recovered(outcome, ctx)
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:

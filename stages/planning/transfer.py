@@ -189,7 +189,7 @@ class TransferRoutine:
         with at.planner.holding(pick.hand):
             carry = free_motion(at.world, rise[-1], pick.lift[-1], self._rng)
         if carry is None:
-            return "release", f"no free way back with {at.world.carried} in the hand"
+            return "release", f"no free way back; in the hand: {at.world.carried}"
         yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
         yield from self._do(f"carry {at.world.carried} back", carry)
         # Straight down the way it came, but for the last waypoint: from there on it is felt for.
