@@ -27,20 +27,18 @@ from benchmarks.estimate import Settings, estimates
 from stages.devices.clutter import Pile, write_clutter
 from stages.geometry.arrays import Floats
 from stages.messages import Hypothesis, Observation, SceneEstimate
-from stages.perception.confidence.doubt import (
+from stages.perception.confidence.calibration import (
     CONSTANTS,
     FEATURES,
     RIGHT_METRES,
     RIGHT_RADIANS,
     Calibration,
-    Evidence,
-    Judge,
-    Judged,
     cost_of_an_object,
     hypothesis_probabilities,
-    judged,
     standardised,
 )
+from stages.perception.confidence.doubt import Judge, judged
+from stages.perception.confidence.evidence import Evidence, Judged
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
 from stages.perception.rendering.depth_noise import StructuredLight

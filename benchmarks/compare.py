@@ -20,6 +20,7 @@ from runner.process.children import ENVIRONMENT
 
 TITLES = {
     "digest": "DIGEST",
+    "depth": "DIGEST without colour",
     "paper": "DIGEST as in the paper",
     "icp": "multi-start ICP",
     "fpfh": "FPFH + RANSAC + ICP",
@@ -27,15 +28,16 @@ TITLES = {
     "perch": "PERCH-style search",
     "random": "random guess",
 }
+_DIGEST: dict[str, list[str]] = {"digest": [], "depth": ["--without", "colour"], "paper": ["--form", "paper"]}
+"""Options of the estimator by method."""
 
 
 def command(method: str, options: argparse.Namespace, out: Path) -> list[str]:
     """What runs one method; DIGEST as its graph would, its replicas dividing the hypotheses of each image."""
     run = [sys.executable, "-m"]
-    if method in ("digest", "paper"):
-        form = "default" if method == "digest" else "paper"
-        share = ["--form", form, "--share", "hypotheses", "--processes", str(options.processes)]
-        run += ["benchmarks.estimate", str(options.dataset), options.detections, str(out), *share]
+    if method in _DIGEST:
+        share = ["--share", "hypotheses", "--processes", str(options.processes)]
+        run += ["benchmarks.estimate", str(options.dataset), options.detections, str(out), *_DIGEST[method], *share]
     else:
         run += ["benchmarks.baselines", method, str(options.dataset), options.detections, str(out)]
     images_wanted = ["--images", options.images] if options.images else []
@@ -46,7 +48,7 @@ def command(method: str, options: argparse.Namespace, out: Path) -> list[str]:
 def main() -> int:
     """Runs, draws and prints; exits 1 where a method fails."""
     options = _options()
-    return _compare(_methods(options.methods), options)
+    return _compare(parse_methods(options.methods), options)
 
 
 def _options() -> argparse.Namespace:
@@ -62,7 +64,12 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _methods(text: str) -> list[str]:
+def parse_methods(text: str) -> list[str]:
+    """The option ``--methods``.
+
+    Raises:
+        Refused: there is no method of that name.
+    """
     methods = text.split(",")
     for method in methods:
         if method not in TITLES:
@@ -78,7 +85,7 @@ def _compare(methods: Sequence[str], options: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     files = {method: folder / f"{method}.csv" for method in methods}
     for method, out in files.items():
-        if not (options.keep and out.exists()) and not _run(method, options, out):
+        if not (options.keep and out.exists()) and not run(method, options, out):
             return 1
     scored = Scored.of(options.dataset, chosen, {TITLES[method]: out for method, out in files.items()})
     kind = boxes.stem.removeprefix("detections_")
@@ -90,7 +97,8 @@ def _compare(methods: Sequence[str], options: argparse.Namespace) -> int:
     return 0
 
 
-def _run(method: str, options: argparse.Namespace, out: Path) -> bool:
+def run(method: str, options: argparse.Namespace, out: Path) -> bool:
+    """Whether a method has written its results."""
     print(f"{TITLES[method]} ...", file=sys.stderr, flush=True)
     done = subprocess.run(
         command(method, options, out), env={**os.environ, **ENVIRONMENT}, stdout=subprocess.DEVNULL, check=False

@@ -38,16 +38,25 @@ _STYLES: tuple[dict[str, Any], ...] = (
 )
 
 
-def draw(path: Path, title: str, methods: Mapping[str, Sequence[Score]]) -> None:
-    """One panel for each position bound, one line for each method; the first method's 95 % interval is shaded."""
-    # matplotlib is an optional extra; the table works without it.
+def sheet(width: float, height: float) -> Any:
+    """An empty figure of matplotlib's, inches.
+
+    Raises:
+        Refused: matplotlib is missing. It is an optional extra; tables work without it.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise Refused("figures need matplotlib; pip install -e '.[benchmarks]'") from None
-    figure: Any = Figure(figsize=(10.0, 7.6), layout="constrained")
+    figure: Any = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def draw(path: Path, title: str, methods: Mapping[str, Sequence[Score]]) -> None:
+    """One panel for each position bound, one line for each method; the first method's 95 % interval is shaded."""
+    figure = sheet(10.0, 7.6)
     panels: Any = figure.subplots(2, 2, sharex=True, sharey=True)
     for panel, metres in zip(panels.flat, POSITION_BOUNDS, strict=True):
         _panel(panel, metres, methods)
@@ -66,7 +75,7 @@ def draw(path: Path, title: str, methods: Mapping[str, Sequence[Score]]) -> None
 def _panel(panel: Any, metres: float, methods: Mapping[str, Sequence[Score]]) -> None:
     panel.set_xscale("function", functions=(np.sqrt, np.square))
     for number, (name, scores) in enumerate(methods.items()):
-        style = {"linewidth": 1.9, **_STYLES[number % len(_STYLES)]}
+        style = line_style(number)
         hits = np.array([sum(one.within(metres, degrees) for one in scores) for degrees in _DEGREES])
         if number == 0:
             panel.fill_between(_DEGREES, *_band(hits, len(scores)), color=style["color"], alpha=0.13, linewidth=0)
@@ -74,6 +83,11 @@ def _panel(panel: Any, metres: float, methods: Mapping[str, Sequence[Score]]) ->
     panel.set_title(f"position within {100 * metres:.0f} cm", loc="left", fontsize=11, color="#222222")
     panel.set_xticks(_TICKS, [str(tick) for tick in _TICKS])
     panel.set_xlim(0, 180)
+    tidy(panel)
+
+
+def tidy(panel: Any) -> None:
+    """Per cent upwards, a light grid, no frame."""
     panel.set_ylim(0, 102)
     panel.set_yticks(range(0, 101, 20))
     panel.grid(color="#DDDDDD", linewidth=0.8)
@@ -83,6 +97,11 @@ def _panel(panel: Any, metres: float, methods: Mapping[str, Sequence[Score]]) ->
     for side in ("left", "bottom"):
         panel.spines[side].set_color("#999999")
     panel.tick_params(colors="#444444", length=3)
+
+
+def line_style(number: int) -> dict[str, Any]:
+    """Of the method of that number."""
+    return {"linewidth": 1.9, **_STYLES[number % len(_STYLES)]}
 
 
 def _band(hits: Iterable[Any], count: int) -> tuple[Floats, Floats]:

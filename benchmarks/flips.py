@@ -24,9 +24,7 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, Truth, detections_file, images
 from benchmarks.estimate import Settings, estimates
 from stages.camera import SimulatedCamera
-from stages.devices import fetch
 from stages.devices.bop_results import Result
-from stages.devices.tabletop import TABLE
 from stages.estimate import Quiet
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, inverse, pose
@@ -37,11 +35,13 @@ from stages.perception.observation.preprocessing import preprocess
 from stages.perception.refinement.refinement import Placed, RefinementSettings, SceneRefiner
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.perception.rendering.renderer import Camera, Item, Renderer
+from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
 ROOT = Path(__file__).parents[1]
 CATALOGUE = ROOT / "stages" / "scene" / "catalogue.yaml"
 FIGURE = ROOT / "docs" / "perception" / "figures" / "flips.png"
+ROBOT = read_robot(BUILT_IN)
 OWN = "simulated looks, from random flips"
 SETS = ("ycb-real", "clutter-ycb", "household-layout", "simulated")
 _SHOWN = ("soup_can", "soup_can", "tuna_can", ("sauce_bottle", "water_bottle", "milk_carton"), ("tea_box", "sugar_box"))
@@ -179,7 +179,7 @@ def _rested(item: CatalogueObject, place: tuple[float, float], rng: np.random.Ge
     R = exp_so3(np.array([0, 0, rng.uniform(-np.pi, np.pi)])) @ item.resting[rng.integers(len(item.resting))]
     lowest = float((item.mesh.vertices @ R[2]).min())
     x, y = np.array(place) + rng.uniform(-0.02, 0.02, 2)
-    return pose(R, np.array([x, y, TABLE.height - lowest]))
+    return pose(R, np.array([x, y, ROBOT.table.height - lowest]))
 
 
 def _look(
@@ -188,8 +188,8 @@ def _look(
     snapshot = Snapshot(
         names=tuple(labels),
         T_base_objects=np.stack(poses),
-        joint_names=tuple(fetch.HOME),
-        joint_positions=np.array(list(fetch.HOME.values())),
+        joint_names=tuple(ROBOT.posture),
+        joint_positions=np.array(list(ROBOT.posture.values())),
         time=0.0,
     )
     frame = camera.on_snapshot(snapshot, Quiet([8, index]))

@@ -16,28 +16,31 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import is_pose
 from stages.messages import Frame, LookRequest, Snapshot
 from stages.perception.rendering.depth_noise import color_noise, structured_light
+from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 
 
 class SimulatedCamera(Stage):
-    """The simulated robot's head camera: renders each snapshot as a structured-light camera would see it."""
+    """The simulated robot's camera: renders each snapshot as a structured-light camera would see it."""
 
     device: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """The catalogue whose meshes are rendered; ``noise: false`` gives perfect images."""
+        """The catalogue and the robot whose meshes are rendered; ``noise: false`` gives perfect images."""
 
         catalogue: Path
+        robot: Path = BUILT_IN
         noise: bool = True
 
     def __init__(self, config: Config) -> None:
-        # OpenGL and the robot's meshes are for this camera only.
-        from stages.devices import fetch, simulated_camera
+        # OpenGL is for this camera only.
+        from stages.devices.simulated_camera import SimulatedCamera
 
         self._noise = config.noise
-        self._fetch, self._K = fetch, simulated_camera.K
-        self._camera = simulated_camera.SimulatedCamera(Catalogue.shared(config.catalogue))
+        self._robot = read_robot(config.robot)
+        self._K = self._robot.camera.K
+        self._camera = SimulatedCamera(Catalogue.shared(config.catalogue), self._robot)
         self._looks = 0
 
     @classmethod
@@ -49,7 +52,7 @@ class SimulatedCamera(Stage):
 
     def on_snapshot(self, snapshot: Snapshot, ctx: Context) -> Frame:
         """The image, which is said to be from where the encoders have the camera."""
-        T_base_camera = self._fetch.camera_pose(snapshot.joint_names, snapshot.joint_positions)
+        T_base_camera = self._robot.camera_pose(snapshot.joint_names, snapshot.joint_positions)
         rgb, depth = self._camera.image(snapshot, T_base_camera)
         if self._noise:
             rgb, depth = color_noise(rgb, ctx.rng), structured_light(depth, self._K, ctx.rng)

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from runner.contract import Context, Level, Message, Refused
 from stages.appraiser import Appraiser
 from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
+from stages.geometry.lens import Lens
 from stages.hypotheses import Hypotheses
 from stages.messages import (
     Assertion,
@@ -85,11 +87,14 @@ def estimate_scene(
     dof: Literal[3, 6] = 6,
     device: Literal["auto", "cpu", "cuda"] = "cpu",
     T_base_camera: Floats | None = None,
+    distortion: Sequence[float] = (),
 ) -> EstimatedScene:
     """The objects on the table in one image, where they are, and how they relate.
 
     ``rgb`` is H x W x 3, sRGB, ``depth`` H x W metres registered to it, 0 or not finite where there is no reading;
-    ``K`` 3 x 3, pixel centres at integer coordinates. ``catalogue`` is a YAML file or a BOP ``models`` folder.
+    ``K`` 3 x 3, pixel centres at integer coordinates; ``distortion`` are OpenCV's coefficients (k1 k2 p1 p2 k3) of the
+    lens that is still in both; boxes and poses are those of the straight image. ``catalogue`` is a YAML file or a BOP
+    ``models`` folder.
 
     Candidates are the ``boxes``, else what ``detector`` finds, else what the network that comes with the package does;
     it knows the objects of its own catalogue. Of these the scene has ``n_objects``, or as many as explain the image
@@ -102,7 +107,7 @@ def estimate_scene(
         Refused: an input is not of its form, a label is not in the catalogue, or there is no support plane.
     """
     path = Path(catalogue)
-    frame = _frame(rgb, depth, K, T_base_camera)
+    frame = _straightened(_frame(rgb, depth, K, T_base_camera), distortion)
     appraiser = None
     if boxes is None:
         candidates = (detector or _network(path)).on_frame(frame, Quiet())
@@ -231,6 +236,14 @@ def _frame(rgb: NDArray[np.uint8], depth: NDArray[np.floating[Any]], K: Floats, 
         T_base_camera=None if T_base_camera is None else np.array(T_base_camera, float), robot_mask=None,
         name="image", index=0, total=1,
     )  # fmt: skip
+
+
+def _straightened(frame: Frame, distortion: Sequence[float]) -> Frame:
+    try:
+        rgb, depth = Lens(frame.K, frame.depth.shape, distortion).straighten(frame.rgb, frame.depth)
+    except ValueError as error:
+        raise Refused(f"distortion: {error}") from None
+    return msgspec.structs.replace(frame, rgb=rgb, depth=depth)
 
 
 def _candidates(boxes: Sequence[Box], catalogue: Catalogue) -> Candidates:

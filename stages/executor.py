@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from runner.contract import Context, Refused, Stage
-from stages.devices import fetch, tabletop
 from stages.messages import Brake, Halt, Outcome, Recover, RobotCommand, RobotState, TransferRequest
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ class Executor(Stage):
         """``attempts``: how many grasps are tried on an object before the transfer is reported as failed."""
 
         catalogue: Path = BUILT_IN
+        robot: Path = ROBOT
         attempts: int = 3
 
         def __post_init__(self) -> None:
@@ -39,7 +41,7 @@ class Executor(Stage):
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._robot = fetch.robot_model()
+        self._robot = read_robot(config.robot)
         self._transfers = TransferRoutine
         self._transfer: TransferRoutine | None = None
         """The newest one."""
@@ -54,7 +56,7 @@ class Executor(Stage):
         self._transfer = self._transfers(
             transfer_request,
             robot=self._robot,
-            table=tabletop.TABLE,
+            table=self._robot.table,
             catalogue=self._catalogue,
             rng=ctx.rng,
             attempts=self._config.attempts,

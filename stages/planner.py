@@ -21,6 +21,7 @@ from stages.planning.placements import Placements, Scene
 from stages.planning.problem import TABLE, Problem, carriers, cycle
 from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
+from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.stance import Stances, Standing
 from stages.scene.virtual import satisfied
@@ -70,20 +71,23 @@ class Planner(Stage):
         """What to plan with, and where the robot can place."""
 
         catalogue: Path
+        robot: Path = BUILT_IN
         engine: str = search.BFS
         """``bfs``, or the name of an installed unified-planning engine."""
-        gripper_width: float = 0.095
-        """Widest object the gripper takes between its fingers, metres."""
+        gripper_width: float | None = None
+        """Widest object the gripper takes between its fingers, metres; None: as the robot's description says."""
         workspace: Workspace = field(default_factory=Workspace)
 
         def __post_init__(self) -> None:
             """Refuses a gripper that does not open."""
-            if not self.gripper_width > 0:
+            if self.gripper_width is not None and not self.gripper_width > 0:
                 raise Refused(f"planner.gripper_width={self.gripper_width}: must be a positive number of metres")
 
     def __init__(self, config: Config) -> None:
         search.check_engine(config.engine)
         self._config = config
+        self._robot = read_robot(config.robot)
+        self._widest = config.gripper_width or self._robot.gripper.widest
         self._catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
@@ -142,9 +146,9 @@ class Planner(Stage):
         if not grasps:
             return "has no grasp in the catalogue"
         narrowest = min(grasp.width for grasp in grasps)
-        if narrowest <= self._config.gripper_width:
+        if narrowest <= self._widest:
             return ""
-        return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * self._config.gripper_width:.1f} cm"
+        return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * self._widest:.1f} cm"
 
     def _check(self, problem: Problem, task: Task) -> None:
         """Raises :class:`Impossible` for goals that no search needs to look at."""
@@ -181,7 +185,7 @@ class Planner(Stage):
     def _solve(self, problem: Problem, task: Task) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
         current = Scene.of(task.current, self._stances)
-        targets = Targets(Placements(task.goal, self._stances), self._config.workspace)
+        targets = Targets(Placements(task.goal, self._stances), self._config.workspace, self._robot)
         avoided = frozenset(task.avoid)
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
         while True:

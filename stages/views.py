@@ -64,6 +64,8 @@ from stages.messages import (
 from stages.messages.digest import ParticleTrace
 from stages.messages.scene import UnknownRegion
 from stages.perception.rendering.renderer import Camera, Item, Renderer
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.relations import TABLE
 from stages.scene.text import SURE, support
@@ -71,6 +73,8 @@ from stages.scene.text import SURE, support
 if TYPE_CHECKING:  # only an export speaks with ROS 2
     from runner.view.ros2_bag import BagMessage
     from stages.devices.ros2.recorded import RecordedScenes
+if TYPE_CHECKING:  # MuJoCo is loaded once there is a robot
+    from stages.robots.body import Body
 
 MOTION_FRAMES = 8
 """Postures shown of one robot motion."""
@@ -79,6 +83,8 @@ TABLE_SIZE = (0.7, 1.1)
 NODE_SPACING = (130.0, 110.0)
 """Pixels between the nodes of a scene graph, across and down."""
 GHOST_TRIANGLES = 80
+_NO_ROBOTS_TABLE = (0.8, 0.0, 0.7)
+"""Where the middle of the table is taken to be in graphs that name no robot, metres."""
 UNSURE = 0.5
 """Probability below which an object is drawn in red."""
 _GREY: Color = (128, 128, 128)
@@ -104,6 +110,11 @@ class Views:
         """A better estimate follows the ranker's."""
         self._frames: dict[tuple[int, int, str], Frame] = {}
         self._posteriors: deque[Posterior] = deque(maxlen=512)
+        robots = [Path(config["robot"]) for config in configs.values() if "robot" in config]
+        self._robot_file = robots[0] if robots else ROBOT
+        # Graphs without a robot need not have one installed.
+        table = read_robot(self._robot_file).table if robots else None
+        self._table = (*table.center, table.height) if table else _NO_ROBOTS_TABLE
         self._joints: dict[str, float] = {}
         self._renderers: dict[tuple[int, int], Renderer] = {}
         self._shown: dict[str, str] = {}
@@ -126,7 +137,16 @@ class Views:
             )
         )
         world = Column(
-            (Panel("World", "space", "world", eye=(1.6, -0.9, 1.45), target=(0.55, 0.03, 0.85)), filters),
+            (
+                Panel(
+                    "World",
+                    "space",
+                    "world",
+                    eye=self._from_table(0.8, -0.9, 0.75),
+                    target=self._from_table(-0.25, 0.03, 0.15),
+                ),
+                filters,
+            ),
             shares=(3, 1.2),
         )
         knowledge = Column(
@@ -138,6 +158,11 @@ class Views:
             shares=(1.2, 1.2, 1),
         )
         return Row((images, world, knowledge), shares=(1, 1.7, 1.1))
+
+    def _from_table(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """A point seen from the middle of the table, in the base frame."""
+        cx, cy, cz = self._table
+        return cx + x, cy + y, cz + z
 
     def static(self) -> Iterable[Drawing]:
         """Nothing: even the robot is only there once it speaks."""
@@ -250,11 +275,15 @@ class Views:
         self._shown = labels
         yield scene_nodes("graph/scene", scene, self._catalogue)
 
+    @cached_property
+    def _body(self) -> Body:
+        return read_robot(self._robot_file).body
+
     def _robot(self, names: Sequence[str], positions: Floats) -> Iterator[Drawing]:
         if not self._joints:
-            yield from robot_shapes()
+            yield from robot_shapes(self._body)
         self._joints.update(zip(names, positions.tolist(), strict=True))
-        yield from robot_posture(self._joints)
+        yield from robot_posture(self._body, self._joints)
 
     def _motion(self, command: RobotCommand) -> Iterator[Drawing]:
         """The commanded motion, thinned; the robot must have been drawn before."""
@@ -263,7 +292,7 @@ class Views:
         for row in np.unique(np.linspace(0, len(command.times) - 1, MOTION_FRAMES).round().astype(int)):
             yield NextStep()
             self._joints.update(zip(command.joint_names, command.positions[row].tolist(), strict=True))
-            yield from robot_posture(self._joints)
+            yield from robot_posture(self._body, self._joints)
 
 
 def palette(labels: Sequence[str]) -> dict[str, Color]:
@@ -492,23 +521,18 @@ def progress_line(message: Message) -> str:
     return line
 
 
-def robot_shapes() -> Iterator[Drawing]:
+def robot_shapes(body: Body) -> Iterator[Drawing]:
     """The meshes of every link, each below its link's path, flat-shaded: corners that share a vertex look dented."""
-    # Graphs without a robot need not have one installed.
-    from stages.devices.fetch import robot_meshes
-
-    for number, (link, mesh) in enumerate(robot_meshes()):
+    for number, (link, mesh) in enumerate(body.meshes):
         corners = mesh.faces.reshape(-1)
         faces = np.arange(len(corners)).reshape(-1, 3)
         yield Mesh3D(f"world/robot/{link}/mesh_{number}", mesh.vertices[corners], faces, mesh.colors[corners])
 
 
-def robot_posture(joints: Mapping[str, float]) -> Iterator[Drawing]:
+def robot_posture(body: Body, joints: Mapping[str, float]) -> Iterator[Drawing]:
     """Where the links are for these joint positions."""
-    from stages.devices.fetch import link_poses, robot_meshes
-
-    poses = link_poses(list(joints), np.array(list(joints.values())))
-    for link in sorted({link for link, _ in robot_meshes()}):
+    poses = body.link_poses(list(joints), np.array(list(joints.values())))
+    for link in sorted({link for link, _ in body.meshes}):
         yield Transform(f"world/robot/{link}", poses[link])
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from msgspec import structs
 
 from runner.contract import Context, Refused, Stage
-from stages.devices import fetch
 from stages.devices.servo import PIECE
 from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
@@ -21,6 +20,8 @@ from stages.devices.tabletop import Layout
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Arrange, Arrangement, Brake, LookRequest, Move, RobotCommand, RobotState, Snapshot
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _DRIFT = 0.01
@@ -42,6 +43,7 @@ class World(Stage):
         """``suite`` is the kind of scenes, ``seed`` draws them."""
 
         catalogue: Path = BUILT_IN
+        robot: Path = ROBOT
         suite: str = "tray"
         seed: int = 0
         goal: str = "auto"
@@ -55,12 +57,13 @@ class World(Stage):
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
-        self._suite = kinds.suite(config.suite, self._catalogue, config.seed, goal=config.goal)
+        self._robot = read_robot(config.robot)
+        self._suite = kinds.suite(config.suite, self._catalogue, self._robot, config.seed, goal=config.goal)
         self._looks = 0
         errors = self._suite.errors(np.random.default_rng(config.seed))
-        self._beyond = np.zeros(len(fetch.JOINT_NAMES)) if errors is None else errors.joints
+        self._beyond = np.zeros(len(self._robot.joint_names)) if errors is None else errors.joints
         self._simulation = Simulation(
-            self._catalogue, self._suite.names, self._suite.table, factors=self._suite.factors
+            self._catalogue, self._robot, self._suite.names, self._suite.table, factors=self._suite.factors
         )
         self._started = False
         """Somebody may meddle: the start scene is laid out."""
@@ -95,7 +98,7 @@ class World(Stage):
         return Snapshot(
             names=self._simulation.present,
             T_base_objects=self._simulation.object_poses(),
-            joint_names=fetch.JOINT_NAMES,
+            joint_names=self._robot.joint_names,
             joint_positions=self._encoders(),
             time=self._simulation.time,
             purpose=look_request.purpose,
@@ -110,7 +113,7 @@ class World(Stage):
         What else arrives is heard in between, so that somebody may meddle or stop the arm.
         """
         servo = self._simulation.servo
-        joints = [fetch.JOINT_NAMES.index(name) for name in robot_command.joint_names]
+        joints = [self._robot.joint_names.index(name) for name in robot_command.joint_names]
         if joints:
             robot_command = structs.replace(robot_command, positions=robot_command.positions + self._beyond[joints])
         try:
@@ -163,7 +166,7 @@ class World(Stage):
     def _state(self) -> RobotState:
         servo = self._simulation.servo
         return RobotState(
-            joint_names=fetch.JOINT_NAMES,
+            joint_names=self._robot.joint_names,
             positions=self._encoders(),
             gripper_width=servo.opening(),
             time=self._simulation.time,

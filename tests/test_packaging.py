@@ -28,6 +28,7 @@ SOURCE = ("runner", "stages", "graphs", "graph.yaml", "pyproject.toml", "README.
 GRAPHS = {
     "tray": (),
     "interactive": (),
+    "ur5e": (),
     "bag": ("--set", "camera.bag=d"),
     "ros2": (),
     "reference": (),

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.devices import fetch
 from stages.devices.drops import distractors, random_layout, things
-from stages.devices.simulated_camera import K, SimulatedCamera
+from stages.devices.simulated_camera import SimulatedCamera
 from stages.devices.suites.tray import GOALS, sample_goal, sample_start
 from stages.geometry.arrays import Floats
 from stages.messages import Snapshot
@@ -18,6 +17,8 @@ from stages.perception.detection.trained.network import HEIGHT, WIDTH, fit
 from stages.perception.detection.trained.training_images import Example, labelled, render_example, save_examples
 from stages.perception.rendering.depth_noise import color_noise
 from stages.perception.rendering.renderer import Camera, Item, Renderer
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 
@@ -38,14 +39,15 @@ def examples(
 
 def episode_examples(catalogue: Catalogue, *, images: int, seed: int) -> Iterator[Example]:
     """What the simulated robot's camera sees of the goal and start scenes of episodes, noise included."""
-    camera, renderer = SimulatedCamera(catalogue), Renderer(WIDTH, HEIGHT)
-    joints, positions = tuple(fetch.HOME), np.array(list(fetch.HOME.values()))
-    T_base_camera = fetch.camera_pose(joints, positions)
+    robot = read_robot(ROBOT)
+    camera, renderer = SimulatedCamera(catalogue, robot), Renderer(WIDTH, HEIGHT)
+    joints, positions = tuple(robot.posture), np.array(list(robot.posture.values()))
+    T_base_camera = robot.camera_pose(joints, positions)
     names = list(catalogue.objects)
     for index in range(images):
         rng = np.random.default_rng([seed, 2, index])
         goal = tuple(GOALS)[index // 2 % len(GOALS)]
-        layout = (sample_goal if index % 2 else sample_start)(goal, catalogue, rng)
+        layout = (sample_goal if index % 2 else sample_start)(goal, catalogue, robot, rng)
         snapshot = Snapshot(
             names=tuple(layout),
             T_base_objects=np.stack(list(layout.values())),
@@ -56,7 +58,7 @@ def episode_examples(catalogue: Catalogue, *, images: int, seed: int) -> Iterato
         rgb, _ = camera.image(snapshot, T_base_camera)
         image, scale = fit(color_noise(rgb, rng))
         items = [Item(catalogue[name].mesh, pose) for name, pose in layout.items()]
-        small = Camera(_scaled(K, scale), T_base_camera)
+        small = Camera(_scaled(robot.camera.K, scale), T_base_camera)
         identity, _ = renderer.instances(items, small)
         yield labelled(image, identity, items, [names.index(name) for name in layout], camera=small, rng=rng)
     renderer.close()

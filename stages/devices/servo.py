@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import lru_cache
 from typing import Any
 
 import mujoco
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from stages.devices import fetch
 from stages.geometry.arrays import Floats
 from stages.messages import RobotCommand
 from stages.messages.robot import Guard, Stopped
+from stages.robots import Robot
 
 PIECE = 0.05
 """Simulated seconds after which a motion lets others in."""
@@ -36,12 +35,23 @@ class Servo:
     Whatever else the motors must do is a force from outside. Only encoders and motor efforts are read.
     """
 
-    def __init__(self, model: Any, data: Any, step: Callable[[], None]) -> None:
+    def __init__(self, robot: Robot, model: Any, data: Any, step: Callable[[], None]) -> None:
         """``step`` lets one time step of the physics pass."""
-        self._model, self._data, self._step = model, data, step
+        self._robot, self._model, self._data, self._step = robot, model, data, step
         self._timestep = float(model.opt.timestep)
-        self._fingers = np.array([model.actuator(name).id for name in fetch.FINGER_JOINTS])
-        self._hand = model.body(fetch.GRIPPER.link).id
+        moved = {
+            k: model.joint(model.actuator_trnid[k, 0]).name
+            for k in range(model.nu)
+            if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT
+        }
+        self.actuators = {name: k for k, name in moved.items()}
+        """By the joint that each moves."""
+        self.fingers = np.array([k for k in range(model.nu) if moved.get(k) not in robot.posture])
+        self._hand = model.body(robot.gripper.link).id
+        alone = robot.specification(seen=False)
+        alone.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self._bare = alone.compile()
+        self._bare_data = mujoco.MjData(self._bare)
         self._asked = False
         self.error = 0.0
         """Largest joint error of the newest command, radians."""
@@ -71,22 +81,28 @@ class Servo:
 
     def opening(self) -> float:
         """Metres between the fingers."""
-        return sum(fetch.GRIPPER.width(float(self._data.joint(name).qpos[0])) for name in fetch.FINGER_JOINTS) / 2
+        gripper = self._robot.gripper
+        return sum(gripper.width(float(self._data.joint(name).qpos[0])) for name in gripper.fingers) / 2
+
+    def grip(self, width: float) -> Floats:
+        """What is commanded to the actuators of the fingers; their own range need not be that of the joints."""
+        gain, bias = self._model.actuator_gainprm[self.fingers, 0], self._model.actuator_biasprm[self.fingers, 1]
+        return self._robot.gripper.finger_position(width) * (-bias / gain)
 
     def _follow(self, command: RobotCommand) -> Iterator[None]:
         joints = [self._model.joint(name) for name in command.joint_names]
-        actuators = np.array([self._model.actuator(name).id for name in command.joint_names])
+        actuators = np.array([self.actuators[name] for name in command.joint_names])
         addresses, dofs = (np.array([getattr(j, key)[0] for j in joints]) for key in ("qposadr", "dofadr"))
         gain = self._model.actuator_gainprm[actuators, 0]
         lag = -self._model.actuator_biasprm[actuators, 2] / gain
-        targets, rates, efforts = _resample(command, self._timestep)
-        arm = np.array([name != "torso_lift_joint" for name in command.joint_names])
+        targets, rates, efforts = self._resample(command)
+        arm = np.array([self._robot.body.turns(name) for name in command.joint_names])
         still, felt = self._data.actuator_force[actuators].copy(), np.zeros(len(actuators))
         for k, (target, rate, effort) in enumerate(zip(targets, rates, efforts, strict=True), 1):
             self._data.ctrl[actuators] = target + lag * rate + effort / gain
             self._step()
             self.error = max(self.error, float(np.abs(self._data.qpos[addresses] - target).max()))
-            # Fetch carries its own weight by other means: an arm that stands and touches nothing takes no effort.
+            # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
             outside = self._data.actuator_force[actuators] - still - effort
             felt += (outside - felt) * self._timestep / _FILTER
             self.force = max(self.force, float((np.abs(felt) / self._levers(dofs))[arm].max()))
@@ -101,10 +117,10 @@ class Servo:
 
     def _grip(self, width: float) -> Iterator[None]:
         """The fingers stall with limited force at what is between them."""
-        start, end = self._data.ctrl[self._fingers[0]], fetch.GRIPPER.finger(width)
+        start, end = self._data.ctrl[self.fingers].copy(), self.grip(width)
         pieces = round(_GRIPPER_RAMP / PIECE)
         for k in range(1, pieces + 1):
-            self._data.ctrl[self._fingers] = start + (end - start) * k / pieces
+            self._data.ctrl[self.fingers] = start + (end - start) * k / pieces
             yield from self._wait(PIECE, None)
             if self.stopped:
                 return
@@ -132,7 +148,7 @@ class Servo:
 
     def _stand(self) -> None:
         """Every joint slows down evenly and then stays."""
-        moving = np.setdiff1d(np.arange(self._model.nu), self._fingers)
+        moving = np.setdiff1d(np.arange(self._model.nu), self.fingers)
         joints = self._model.actuator_trnid[moving, 0]
         position = self._data.qpos[self._model.jnt_qposadr[joints]].copy()
         rate = self._data.qvel[self._model.jnt_dofadr[joints]].copy()
@@ -150,36 +166,26 @@ class Servo:
         mujoco.mj_jacBody(self._model, self._data, linear, None, self._hand)
         return np.maximum(np.linalg.norm(linear[:, dofs], axis=0), _SHORTEST_LEVER)
 
+    def _resample(self, command: RobotCommand) -> tuple[Floats, Floats, Floats]:
+        """The trajectory at every time step of the simulation, and the efforts that it takes."""
+        times = command.times
+        if len(times) < 2:
+            return command.positions, command.velocities, np.zeros_like(command.positions)
+        spline = CubicHermiteSpline(times, command.positions, command.velocities)
+        steps = np.minimum(np.arange(1, round(times[-1] / self._timestep) + 1) * self._timestep, times[-1])
+        efforts = self._efforts(command, np.gradient(command.velocities, times, axis=0))
+        return spline(steps), spline(steps, 1), np.stack([np.interp(steps, times, one) for one in efforts.T], axis=1)
 
-def _resample(command: RobotCommand, timestep: float) -> tuple[Floats, Floats, Floats]:
-    """The trajectory at every time step of the simulation, and the efforts that it takes."""
-    times = command.times
-    if len(times) < 2:
-        return command.positions, command.velocities, np.zeros_like(command.positions)
-    spline = CubicHermiteSpline(times, command.positions, command.velocities)
-    steps = np.minimum(np.arange(1, round(times[-1] / timestep) + 1) * timestep, times[-1])
-    efforts = _efforts(command, np.gradient(command.velocities, times, axis=0))
-    return spline(steps), spline(steps, 1), np.stack([np.interp(steps, times, one) for one in efforts.T], axis=1)
-
-
-def _efforts(command: RobotCommand, accelerations: Floats) -> Floats:
-    """T x J, newton metres (newtons) that a trajectory takes with nothing in the hand: inverse dynamics."""
-    model, data = _robot_alone()
-    joints = [model.joint(name) for name in command.joint_names]
-    addresses, dofs = (np.array([getattr(joint, key)[0] for joint in joints]) for key in ("qposadr", "dofadr"))
-    for name, position in fetch.HOME.items():
-        data.joint(name).qpos[0] = position
-    result = np.zeros_like(command.positions)
-    for k, (q, v, a) in enumerate(zip(command.positions, command.velocities, accelerations, strict=True)):
-        data.qpos[addresses], data.qvel[dofs], data.qacc[dofs] = q, v, a
-        mujoco.mj_inverse(model, data)
-        result[k] = data.qfrc_inverse[dofs]
-    return result
-
-
-@lru_cache(maxsize=1)
-def _robot_alone() -> tuple[Any, Any]:
-    spec = fetch.specification()
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model = spec.compile()
-    return model, mujoco.MjData(model)
+    def _efforts(self, command: RobotCommand, accelerations: Floats) -> Floats:
+        """T x J, newton metres (newtons) that a trajectory takes with nothing in the hand: inverse dynamics."""
+        model, data = self._bare, self._bare_data
+        joints = [model.joint(name) for name in command.joint_names]
+        addresses, dofs = (np.array([getattr(joint, key)[0] for joint in joints]) for key in ("qposadr", "dofadr"))
+        for name, position in self._robot.posture.items():
+            data.joint(name).qpos[0] = position
+        result = np.zeros_like(command.positions)
+        for k, (q, v, a) in enumerate(zip(command.positions, command.velocities, accelerations, strict=True)):
+            data.qpos[addresses], data.qvel[dofs], data.qacc[dofs] = q, v, a
+            mujoco.mj_inverse(model, data)
+            result[k] = data.qfrc_inverse[dofs]
+        return result

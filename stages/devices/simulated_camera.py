@@ -1,4 +1,4 @@
-"""The simulated head camera: renders table, room, objects and robot, and finds the robot's own pixels."""
+"""The simulated camera: renders table, room, objects and robot, and finds the robot's own pixels."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.devices import fetch
-from stages.devices.tabletop import TABLE
 from stages.geometry.arrays import Floats
-from stages.geometry.camera import intrinsics
 from stages.messages import Snapshot
 from stages.messages.arrays import Depth, Mask, Rgb
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
-from stages.planning.collision import Table
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.catalogue.household_meshes import block
 from stages.scene.scoring import label_of
 
-WIDTH, HEIGHT = fetch.CAMERA_SIZE
-K = intrinsics(fetch.CAMERA_FOCAL, WIDTH, HEIGHT)
 ROBOT_MARGIN = 0.03
 """Metres by which the robot's surface may lie behind a reading and still be what was read."""
 _MASK_GROWTH = 3
@@ -40,9 +35,9 @@ _SKY = (214, 218, 222)
 class SimulatedCamera:
     """Renders snapshots of the simulated world. One per process: it owns an OpenGL context."""
 
-    def __init__(self, catalogue: Catalogue) -> None:
-        self._catalogue = catalogue
-        self._renderer = Renderer(WIDTH, HEIGHT)
+    def __init__(self, catalogue: Catalogue, robot: Robot) -> None:
+        self._catalogue, self._robot, self._K = catalogue, robot, robot.camera.K
+        self._renderer = Renderer(*robot.camera.size)
 
     def image(self, snapshot: Snapshot, T_base_camera: Floats) -> tuple[Rgb, Depth]:
         """The lit colour image (H x W x 3) and the depth image without noise (H x W, metres).
@@ -52,14 +47,14 @@ class SimulatedCamera:
         errors = snapshot.errors
         if errors is None:
             items = self._items(snapshot, snapshot.joint_positions)
-            camera = Camera(K, T_base_camera)
+            camera = Camera(self._K, T_base_camera)
             rgb = self._renderer.color(items, camera, lighting=_ROOM_LIGHT, background=_SKY)
             return rgb, self._renderer.depth(items, camera)
         positions = snapshot.joint_positions + errors.joints
         items = self._items(snapshot, positions)
-        T_base_color = fetch.camera_pose(snapshot.joint_names, positions) @ errors.T_believed_true
-        rgb = self._renderer.color(items, Camera(K, T_base_color), lighting=_ROOM_LIGHT, background=_SKY)
-        depth = self._renderer.depth(items, Camera(K, T_base_color @ errors.T_color_depth))
+        T_base_color = self._robot.camera_pose(snapshot.joint_names, positions) @ errors.T_believed_true
+        rgb = self._renderer.color(items, Camera(self._K, T_base_color), lighting=_ROOM_LIGHT, background=_SKY)
+        depth = self._renderer.depth(items, Camera(self._K, T_base_color @ errors.T_color_depth))
         return np.clip(np.round(rgb * errors.gains), 0, 255).astype(np.uint8), depth * np.float32(errors.depth)
 
     def robot_mask(self, snapshot: Snapshot, T_base_camera: Floats, depth: Depth) -> Mask:
@@ -68,8 +63,8 @@ class SimulatedCamera:
         Pixels that the robot's rendered surface covers, unless the reading lies clearly in front of it; grown by
         three pixels for noise at its outline.
         """
-        items = robot(snapshot.joint_names, snapshot.joint_positions)
-        body = self._renderer.depth(items, Camera(K, T_base_camera))
+        items = self._links(snapshot.joint_names, snapshot.joint_positions)
+        body = self._renderer.depth(items, Camera(self._K, T_base_camera))
         return robot_pixels(body, depth)
 
     def close(self) -> None:
@@ -79,7 +74,11 @@ class SimulatedCamera:
     def _items(self, snapshot: Snapshot, joint_positions: Floats) -> list[Item]:
         poses = zip(snapshot.names, snapshot.T_base_objects, strict=True)
         objects = (Item(self._catalogue[label_of(name, self._catalogue)].mesh, T) for name, T in poses)
-        return [*room(_table(snapshot)), *objects, *robot(snapshot.joint_names, joint_positions)]
+        table = _table(snapshot) or self._robot.table
+        return [*room(table, self._robot.floor), *objects, *self._links(snapshot.joint_names, joint_positions)]
+
+    def _links(self, joint_names: Sequence[str], positions: Floats) -> list[Item]:
+        return [Item(mesh, T) for mesh, T in self._robot.links(joint_names, positions)]
 
 
 def robot_pixels(body: Depth, depth: Depth) -> Mask:
@@ -89,29 +88,23 @@ def robot_pixels(body: Depth, depth: Depth) -> Mask:
     return cv2.dilate(covered.astype(np.uint8), kernel).astype(bool)
 
 
-def robot(joint_names: Sequence[str], positions: Floats) -> list[Item]:
-    """Every link of the robot where the joint positions put it."""
-    T_base_links = fetch.link_poses(joint_names, positions)
-    return [Item(mesh, T_base_links[link]) for link, mesh in fetch.robot_meshes()]
-
-
-def _table(snapshot: Snapshot) -> Table:
-    """The table of the snapshot; the usual one where it names none."""
+def _table(snapshot: Snapshot) -> Table | None:
+    """The table of the snapshot; None where it names none."""
     if snapshot.T_base_table is None or snapshot.table_size is None:
-        return TABLE
+        return None
     x, y, height = snapshot.T_base_table[:3, 3].tolist()
     depth, width = snapshot.table_size.tolist()
     return Table(center=(x, y), size=(depth, width), height=height)
 
 
 @lru_cache(maxsize=1)
-def room(table: Table = TABLE) -> tuple[Item, ...]:
-    """Table, floor and walls, in the robot's base frame."""
+def room(table: Table, ground: float) -> tuple[Item, ...]:
+    """Table, floor (at height ``ground``) and walls, in the robot's base frame."""
     x, y = table.center
     depth, width = table.size
     top = _painted((depth, width, table.thickness), 0.012, _planks)
-    leg = _painted((0.05, 0.05, table.height - table.thickness), 0.2, _plain((92, 84, 78)))
-    leg_height = (table.height - table.thickness) / 2
+    leg = _painted((0.05, 0.05, table.height - table.thickness - ground), 0.2, _plain((92, 84, 78)))
+    leg_height = (table.height - table.thickness + ground) / 2
     corners = [(sx * (depth / 2 - 0.05), sy * (width / 2 - 0.05)) for sx in (-1, 1) for sy in (-1, 1)]
     floor = _painted((6.0, 6.0, 0.02), 0.05, _tiles)
     wall = _painted((0.02, 6.0, 2.6), 0.1, _plain((206, 204, 196)))
@@ -119,9 +112,9 @@ def room(table: Table = TABLE) -> tuple[Item, ...]:
     return (
         _at(top, x, y, table.height - table.thickness / 2),
         *(_at(leg, x + dx, y + dy, leg_height) for dx, dy in corners),
-        _at(floor, 1.0, 0.0, -0.01),
-        _at(wall, 2.6, 0.0, 1.3),
-        *(_at(side, 1.0, sign * 2.4, 1.3) for sign in (-1, 1)),
+        _at(floor, 1.0, 0.0, ground - 0.01),
+        _at(wall, 2.6, 0.0, ground + 1.3),
+        *(_at(side, 1.0, sign * 2.4, ground + 1.3) for sign in (-1, 1)),
     )
 
 

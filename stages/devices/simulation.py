@@ -1,4 +1,4 @@
-"""The simulated world: Fetch at a table with catalogue objects, in MuJoCo."""
+"""The simulated world: a robot at a table with catalogue objects, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 
-from stages.devices import fetch
 from stages.devices.servo import Servo
-from stages.devices.tabletop import TABLE
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.collision import Table, add_primitives, add_table, quaternion
+from stages.planning.collision import add_primitives, add_table, quaternion
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of
 
-FINGER_LINKS = ("r_gripper_finger_link", "l_gripper_finger_link")
 _TIMESTEP = 0.002
 _DROP = 0.002
 """Metres above their support at which objects are laid out."""
@@ -44,27 +42,31 @@ class Simulation:
     def __init__(
         self,
         catalogue: Catalogue,
+        robot: Robot,
         names: tuple[str, ...],
-        table: Table = TABLE,
+        table: Table,
         *,
         factors: Mapping[str, Factors] = MappingProxyType({}),
     ) -> None:
         """``factors``: of objects that are not as the catalogue has them."""
-        self._names = self.present = names
-        spec = fetch.specification()
+        self._robot, self._names, self.present = robot, names, names
+        spec = robot.specification()
         option = spec.option
         option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
         # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
         option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+        floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+        floor.pos = [0, 0, robot.floor]
         add_table(spec, table)
         for name in names:
             _add_object(spec, name, catalogue[label_of(name, catalogue)], factors.get(name, Factors()))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self.servo = Servo(self._model, self._data, self._step)
-        self._index()
+        self.servo = Servo(robot, self._model, self._data, self._step)
+        self._joints = np.array([self._model.joint(name).qposadr[0] for name in robot.joint_names])
+        self._pads = [self._model.geom(name).id for name in robot.model.pads]
+        self._rough = self._model.geom_friction[self._pads].copy()
 
     @property
     def time(self) -> float:
@@ -84,7 +86,7 @@ class Simulation:
             self._put(name, T)
         self.present = tuple(name for name in self._names if name in layout)
         for k, name in enumerate(name for name in self._names if name not in layout):
-            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, 0.1
+            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, self._robot.floor + 0.1
         self.run(settle)
 
     def place(self, name: str, T_base_object: Floats, *, settle: float = 1.0) -> None:
@@ -104,7 +106,9 @@ class Simulation:
 
     def remove(self, name: str) -> None:
         """Puts an object out of the way and out of sight."""
-        self._put(name, pose(np.eye(3), np.array([_AWAY[0], _AWAY[1] * self._names.index(name), 0.1])))
+        self._put(
+            name, pose(np.eye(3), np.array([_AWAY[0], _AWAY[1] * self._names.index(name), self._robot.floor + 0.1]))
+        )
         self.present = tuple(one for one in self.present if one != name)
 
     def touching(self, name: str) -> set[str]:
@@ -117,13 +121,13 @@ class Simulation:
 
     def held(self) -> str:
         """The object that both fingers touch and nothing else does; empty where there is none."""
-        return next((name for name in self.present if self.touching(name) == set(FINGER_LINKS)), "")
+        others = {"table", *self.present}
+        touched = {name: self.touching(name) for name in self.present}
+        return next((name for name, bodies in touched.items() if len(bodies) > 1 and not bodies & others), "")
 
     def slide(self, factor: float) -> None:
         """Makes the finger pads as rough as ``factor`` times what they are."""
-        for link in FINGER_LINKS:
-            geom = self._model.body(link).geomadr[0]
-            self._model.geom_friction[geom] = [factor, 0.02 * factor, 0.001 * factor]
+        self._model.geom_friction[self._pads] = factor * self._rough
 
     def run(self, seconds: float) -> None:
         """Lets time pass."""
@@ -134,7 +138,7 @@ class Simulation:
         mujoco.mj_step(self._model, self._data)
 
     def encoders(self) -> Floats:
-        """Positions of :data:`stages.devices.fetch.JOINT_NAMES`."""
+        """Positions of the joints that :attr:`stages.robots.Robot.joint_names` names."""
         return self._data.qpos[self._joints].copy()
 
     def layout(self) -> dict[str, Floats]:
@@ -143,7 +147,7 @@ class Simulation:
 
     def hand(self) -> Floats:
         """x, y, z of the hand, metres."""
-        return self._data.body(fetch.GRIPPER.link).xpos.copy()
+        return self._data.body(self._robot.gripper.link).xpos.copy()
 
     def object_poses(self) -> Floats:
         """N x 4 x 4: T_base_object of every object that is ``present``, in that order."""
@@ -151,17 +155,13 @@ class Simulation:
         return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies])
 
     def _go_home(self) -> None:
-        for name, position in fetch.HOME.items():
+        gripper = self._robot.gripper
+        for name, position in self._robot.posture.items():
             self._data.joint(name).qpos[0] = position
-            self._data.actuator(name).ctrl[0] = position
-        finger = fetch.GRIPPER.finger(fetch.GRIPPER.open_width)
-        for name in fetch.FINGER_JOINTS:
-            self._data.joint(name).qpos[0] = finger
-        self._data.ctrl[self._fingers] = finger
-
-    def _index(self) -> None:
-        self._joints = np.array([self._model.joint(name).qposadr[0] for name in fetch.JOINT_NAMES])
-        self._fingers = np.array([self._model.actuator(name).id for name in fetch.FINGER_JOINTS])
+            self._data.ctrl[self.servo.actuators[name]] = position
+        for name, position in gripper.posture(gripper.open_width).items():
+            self._data.joint(name).qpos[0] = position
+        self._data.ctrl[self.servo.fingers] = self.servo.grip(gripper.open_width)
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject, factors: Factors) -> None:

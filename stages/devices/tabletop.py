@@ -1,34 +1,28 @@
-"""The table that the robot stands at, and what its head camera sees of what is laid out there."""
+"""What the robot's camera sees of what is laid out on the table."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
-from stages.devices import fetch
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
-from stages.planning.collision import Table
+from stages.robots import Robot
 from stages.scene.catalogue import CatalogueObject
-
-TABLE = Table(center=(0.80, 0.0), size=(0.70, 1.20), height=0.70)
 
 Layout = dict[str, Floats]
 """T_base_object (4 x 4) by name, supporters before what they support."""
 
 HIDDEN = 0.5
 """Largest share of an object's image rectangle that the rectangle of an object in front may cover."""
-_IMAGE = np.array(fetch.CAMERA_SIZE, float)
-"""Pixels; what the head camera sees of a scene is judged with these."""
 _BORDER = 6.0
+"""Pixels."""
 
 
-def is_seen(objects: Sequence[tuple[CatalogueObject, Floats]], hidden: float = HIDDEN) -> bool:
-    """Every object (at its T_base_object) wholly in the head camera's image and no more ``hidden`` by another one."""
-    rectangles = [image_rectangle(*each) for each in objects]
-    if not all(is_inside_image(rectangle) for rectangle in rectangles):
+def is_seen(robot: Robot, objects: Sequence[tuple[CatalogueObject, Floats]], hidden: float = HIDDEN) -> bool:
+    """Every object (at its T_base_object) wholly in the camera's image and no more ``hidden`` by another one."""
+    rectangles = [image_rectangle(robot, *each) for each in objects]
+    if not all(is_inside_image(robot, rectangle) for rectangle in rectangles):
         return False
     low, high = np.array([r[0] for r in rectangles]), np.array([r[1] for r in rectangles])
     overlap = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0).prod(-1)
@@ -40,23 +34,17 @@ def is_seen(objects: Sequence[tuple[CatalogueObject, Floats]], hidden: float = H
     return bool((covered[behind] <= hidden).all())
 
 
-def is_inside_image(rectangle: Floats) -> bool:
-    """Whether a rectangle of pixels (2 x 2) lies in the head camera's image, away from its border."""
-    return bool((rectangle[0] >= _BORDER).all() and (rectangle[1] <= _IMAGE - _BORDER).all())
+def is_inside_image(robot: Robot, rectangle: Floats) -> bool:
+    """Whether a rectangle of pixels (2 x 2) lies in the camera's image, away from its border."""
+    return bool((rectangle[0] >= _BORDER).all() and (rectangle[1] <= np.array(robot.camera.size) - _BORDER).all())
 
 
-def image_rectangle(entry: CatalogueObject, T_base_object: Floats) -> Floats:
-    """2 x 2: lowest and highest pixel coordinates of the enclosing box."""
+def image_rectangle(robot: Robot, entry: CatalogueObject, T_base_object: Floats) -> Floats:
+    """2 x 2: lowest and highest pixel coordinates of the enclosing box, seen while the robot is at home."""
     corners = np.array(
         [[entry.bounds[i, 0], entry.bounds[j, 1], entry.bounds[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]
     )
-    T = T_camera_base() @ T_base_object
+    T = robot.T_camera_base @ T_base_object
     points = corners @ T[:3, :3].T + T[:3, 3]
-    pixels = points[:, :2] / points[:, 2:] * fetch.CAMERA_FOCAL + _IMAGE / 2
+    pixels = points[:, :2] / points[:, 2:] * robot.camera.focal + np.array(robot.camera.size) / 2
     return np.stack([pixels.min(0), pixels.max(0)])
-
-
-@lru_cache(maxsize=1)
-def T_camera_base() -> Floats:
-    """Of the head camera while the robot is at home, 4 x 4."""
-    return inverse(fetch.camera_pose(tuple(fetch.HOME), np.array(list(fetch.HOME.values()))))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -12,7 +11,7 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.robot import RobotModel
+from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Primitive
 
 AMPLE = 0.015
@@ -20,18 +19,6 @@ AMPLE = 0.015
 
 _ROBOT, _NEAR_ROBOT, _NEAR_HELD, _HELD = 1, 2, 4, 8
 """Contact bits: what the robot, what keeps clear of it, what keeps clear of the held object, the held object."""
-_HAND = ("wrist_flex_link", "wrist_roll_link", "gripper_link", "r_gripper_finger_link", "l_gripper_finger_link")
-"""Links that may come near the held object."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table top: a slab whose upper face is horizontal; metres, robot base frame."""
-
-    center: tuple[float, float]
-    size: tuple[float, float]
-    height: float
-    thickness: float = 0.04
 
 
 def add_table(spec: Any, table: Table) -> Any:
@@ -63,7 +50,7 @@ class CollisionWorld:
 
     def __init__(
         self,
-        robot: RobotModel,
+        robot: Robot,
         table: Table,
         objects: Mapping[str, tuple[CatalogueObject, Floats]],
         *,
@@ -82,7 +69,7 @@ class CollisionWorld:
 
     def set_width(self, width: float) -> None:
         """Opens the fingers to ``width`` metres for all checks that follow."""
-        self._data.qpos[self._fingers] = self.robot.gripper.finger(width)
+        self._data.qpos[self._fingers] = list(self.robot.gripper.posture(width).values())
 
     def hand(self, q: Floats) -> Floats:
         """Forward kinematics: T_base_hand (4 x 4) at joint positions ``q`` (J)."""
@@ -179,9 +166,11 @@ class CollisionWorld:
             self._model.geom_contype[geoms] = before
 
     def _compile(self, table: Table, objects: Mapping[str, tuple[CatalogueObject, Floats]]) -> Any:
-        spec = self.robot.specification()
+        spec = self.robot.specification(seen=False)
+        hand = spec.body(self.robot.hand)
+        links = {hand.name, *(body.name for body in hand.find_all(mujoco.mjtObj.mjOBJ_BODY))}
         for geom in spec.geoms:
-            near_hand = 0 if geom.parent.name in _HAND else _HELD
+            near_hand = 0 if geom.parent.name in links else _HELD
             geom.contype, geom.conaffinity = _ROBOT, _ROBOT | _NEAR_ROBOT | near_hand
         obstacles = [add_table(spec, table)]
         for name, (entry, T) in objects.items():
@@ -190,7 +179,10 @@ class CollisionWorld:
         for geom in obstacles:
             geom.contype, geom.conaffinity, geom.margin = _NEAR_ROBOT | _NEAR_HELD, 0, AMPLE
         gripper = self.robot.gripper
-        hand = spec.body(gripper.link).add_body(name="hand", pos=[gripper.reach, 0, 0])
+        T_link_hand = gripper.T_link_hand
+        hand = spec.body(gripper.link).add_body(
+            name="hand frame", pos=T_link_hand[:3, 3], quat=quaternion(T_link_hand[:3, :3])
+        )
         for geom in add_primitives(hand.add_body(name="held"), objects[self.carried][0].collision):
             geom.contype, geom.conaffinity, geom.mass = 0, 0, 1e-6
         return spec.compile()
@@ -199,12 +191,12 @@ class CollisionWorld:
         model, joints = self._model, [self._model.joint(name) for name in self.robot.joints]
         self._q = np.array([joint.qposadr[0] for joint in joints])
         self._v = np.array([joint.dofadr[0] for joint in joints])
-        self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.gripper.joints])
-        self._hand = model.body("hand").id
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.gripper.posture(0.0)])
+        self._hand = model.body("hand frame").id
         # A joint without limits turns freely; half a turn either way reaches every angle.
         limits = [model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.pi, np.pi) for j in joints]
         self.lower, self.upper = np.array(limits).T
-        for name, position in self.robot.head.items():
+        for name, position in self.robot.still.items():
             self._data.joint(name).qpos[0] = position
 
     def _geoms_of(self, body: str) -> list[int]:

@@ -19,7 +19,7 @@ import ompl.util as ou
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld, quaternion
-from stages.planning.robot import RobotModel
+from stages.robots import Robot
 
 POSITION_TOLERANCE = 5e-4
 """Metres per axis at which inverse kinematics is content."""
@@ -148,7 +148,7 @@ def densify(waypoints: Floats, step: float) -> Floats:
     return np.array(dense)
 
 
-def time_parameterise(robot: RobotModel, waypoints: Floats, *, speed: float = 0.7) -> Trajectory:
+def time_parameterise(robot: Robot, waypoints: Floats, *, speed: float = 0.7) -> Trajectory:
     """Fastest traversal of ``waypoints`` (W x J) within ``speed`` times the joint limits (TOPP-RA, Pham 2018)."""
     points = densify(waypoints, _SPLINE_STEP)
     if len(points) < 2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -16,15 +16,12 @@ from stages.planning.placements import Placement, Placements, Scene
 from stages.planning.problem import TABLE
 from stages.planning.search import Step
 from stages.planning.sight import hidden_share
+from stages.robots import Gripper, Robot
 from stages.scene.catalogue import Grasp
 from stages.scene.stance import Standing
 
 TOUCHING = 0.002
 """Objects whose heights overlap by less than this are above each other, metres."""
-HAND = (0.14, 0.05)
-"""Length along the approach and thickness of the gripper with its fingers, metres."""
-FINGER = 0.035
-"""Room that an opening finger takes beside the object, metres."""
 MIDDLE = 0.01
 """Metres from the edge of a surface, half of the way on small ones, where the middle of what overhangs it must stay."""
 HIDDEN = 0.1
@@ -36,13 +33,17 @@ CROWDED = 0.08
 ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
 """Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
 
+ANYWHERE = (-10.0, 10.0)
+"""Metres: no limit beside the robot's own."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workspace:
-    """Where the robot places, in the base frame, and how much room objects need; metres."""
+    """Where to place, in the base frame, and how much room objects need; metres."""
 
-    x: tuple[float, float] = (0.45, 0.80)
-    y: tuple[float, float] = (-0.42, 0.42)
+    x: tuple[float, float] = ANYWHERE
+    y: tuple[float, float] = ANYWHERE
+    """Narrower than the area in which the robot places, where they are."""
     clearance: float = 0.005
     """Least gap between footprints."""
     edge: float = 0.02
@@ -63,6 +64,12 @@ class Workspace:
         for name in ("targets", "considered"):
             if getattr(self, name) < 1:
                 raise Refused(f"planner.workspace.{name}={getattr(self, name)}: must be 1 or more")
+
+    def of(self, robot: Robot) -> Workspace:
+        """The part of it in which the robot places."""
+        (x0, x1), (y0, y1) = robot.x, robot.y
+        x, y = (max(x0, self.x[0]), min(x1, self.x[1])), (max(y0, self.y[0]), min(y1, self.y[1]))
+        return replace(self, x=x, y=y)
 
     def outside(self, T_base_object: Floats) -> float:
         """How far a pose lies outside the area, metres; 0 inside."""
@@ -89,9 +96,9 @@ class Crowded:
 class Targets:
     """Chooses poses for the steps of a plan, each in the scene that the steps before it leave behind."""
 
-    def __init__(self, placements: Placements, workspace: Workspace) -> None:
+    def __init__(self, placements: Placements, workspace: Workspace, robot: Robot) -> None:
         self._placements = placements
-        self._workspace = workspace
+        self._workspace, self._gripper = workspace.of(robot), robot.gripper
 
     def of(
         self,
@@ -226,7 +233,7 @@ class Targets:
     def _with_room(self, placements: Sequence[Placement], step: Step, scene: Scene) -> list[Standing]:
         """Sorted again: a pose at which few grasps have room for the gripper comes later."""
         others = scene.others(step.item, step.destination)
-        costs = [p.cost + 0.05 * (1 - _share_of_grasps(p.standing, others)) for p in placements]
+        costs = [p.cost + 0.05 * (1 - _share_of_grasps(p.standing, others, self._gripper)) for p in placements]
         return [placements[k].standing for k in np.argsort(costs, kind="stable")]
 
 
@@ -260,16 +267,16 @@ def _hidden(item: Standing, others: Sequence[Standing], scene: Scene) -> float:
     return 0.0 if scene.eye is None else HIDDEN * hidden_share(item, others, scene.eye)
 
 
-def _share_of_grasps(item: Standing, others: Sequence[Standing]) -> float:
+def _share_of_grasps(item: Standing, others: Sequence[Standing], gripper: Gripper) -> float:
     """Share of the object's grasps at which the open gripper touches nothing else."""
     grasps = item.stance.item.grasps
-    near = [other for other in others if regions.separation(item.outline, other.outline) < HAND[0] + FINGER]
-    return sum(_hand_fits(grasp, item, near) for grasp in grasps) / max(1, len(grasps))
+    room = gripper.length + gripper.finger
+    near = [other for other in others if regions.separation(item.outline, other.outline) < room]
+    return sum(_hand_fits(grasp, item, near, gripper) for grasp in grasps) / max(1, len(grasps))
 
 
-def _hand_fits(grasp: Grasp, item: Standing, others: Sequence[Standing]) -> bool:
-    half = grasp.width / 2 + FINGER
-    length, thickness = HAND
+def _hand_fits(grasp: Grasp, item: Standing, others: Sequence[Standing], gripper: Gripper) -> bool:
+    half, length, thickness = grasp.width / 2 + gripper.finger, gripper.length, gripper.thickness
     corners = [[x, y, z, 1.0] for x in (-length, 0.0) for y in (-half, half) for z in (-thickness / 2, thickness / 2)]
     points = np.array(corners) @ (item.T_table_object @ grasp.T_object_grasp).T
     outline = regions.hull(points[:, :2])

@@ -15,7 +15,7 @@ from stages.geometry.poses import inverse
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
-from stages.planning.collision import CollisionWorld, Table
+from stages.planning.collision import CollisionWorld
 from stages.planning.motion import free_motion, straight_motion, time_parameterise
 from stages.planning.pick_place import (
     HOVER,
@@ -29,7 +29,7 @@ from stages.planning.pick_place import (
     opening,
     raised,
 )
-from stages.planning.robot import RobotModel
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 
 Routine = Generator[RobotCommand, RobotState, "Outcome"]
@@ -47,8 +47,8 @@ _EARLY = 0.025
 """Metres above the target from which on a touch, while an object is lowered, is its support."""
 _CONTACT = 0.001
 """Metres that the hand must lag behind while it is lowered to count as contact."""
-_TOUCH = 3.0
-"""Newtons at the hand that are a touch: a heavy object that slides, or a light one that is squeezed."""
+_TOUCH, _BUMP = 4.0, 7.0
+"""Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
 _RUB = 15.0
 """Newtons that do not matter where the hand leaves what it has let go of."""
 _EMPTY = 0.003
@@ -99,7 +99,7 @@ class TransferRoutine:
         self,
         request: TransferRequest,
         *,
-        robot: RobotModel,
+        robot: Robot,
         table: Table,
         catalogue: Catalogue,
         rng: np.random.Generator,
@@ -219,11 +219,10 @@ class TransferRoutine:
         world, plan, grasp = at.world, at.plan, at.plan.pick.hand.grasp
         self._tally.attempts += 1
         self._tally.grasp = grasp.name
-        free = Guard(force=_TOUCH)
         yield from self._do("open the hand", width=opening(world, grasp, ROOM))
-        yield from self._do(f"reach for {world.carried}", plan.reach, guard=free)
+        yield from self._do(f"reach for {world.carried}", plan.reach, guard=Guard(force=_BUMP))
         close = f"close on {world.carried}"
-        state = yield from self._do(close, plan.pick.approach, speed=_SLOW, width=0.0, guard=free)
+        state = yield from self._do(close, plan.pick.approach, speed=_SLOW, width=0.0, guard=Guard(force=_TOUCH))
         if not self._is_held(state, grasp):
             return (yield from self._back_off(world, plan, state))
         self.in_hand = world.carried
@@ -231,9 +230,9 @@ class TransferRoutine:
         narrowest, widest = self._held_between(grasp)
         lifting = Guard(narrowest=narrowest, widest=widest)
         yield from self._do(f"lift {world.carried}", plan.pick.lift, speed=_SLOW, guard=lifting)
-        carrying = replace(lifting, force=_TOUCH + _G * self._objects[world.carried][0].mass)
-        yield from self._do(f"carry {world.carried}", plan.carry, guard=carrying)
-        return (yield from self._put_down(at, plan.place, guard=carrying))
+        weight = _G * self._objects[world.carried][0].mass
+        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + weight))
+        return (yield from self._put_down(at, plan.place, guard=replace(lifting, force=_TOUCH + weight)))
 
     def _back_off(self, world: CollisionWorld, plan: PickPlace, state: RobotState) -> Steps:
         """Out of a grasp that closed on nothing."""
@@ -256,7 +255,8 @@ class TransferRoutine:
             height = world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3]
             if state.stopped != "touch" or height > _EARLY:
                 raise
-        held, wanted = state.gripper_width, state.gripper_width + 2 * RELEASE
+        held = state.gripper_width
+        wanted = min(held + 2 * RELEASE, self._robot.gripper.open_width)
         state = yield from self._do(f"let go of {world.carried}", width=wanted)
         self.in_hand = ""
         left = world.hand(q) @ inverse(at.plan.pick.hand.T_object_hand)
@@ -268,7 +268,7 @@ class TransferRoutine:
         yield from self._do("open the hand", width=self._robot.gripper.open_width)
         world.set_width(self._robot.gripper.open_width)
         failure = yield from self._home(world, retreat[-1])
-        if state.gripper_width < held + RELEASE:
+        if state.gripper_width < (held + wanted) / 2:
             self._tally.T_base_object = None
             return "release", f"the hand opened to {1e3 * state.gripper_width:.0f} mm of {1e3 * wanted:.0f}"
         if not (felt or failure[0]):
@@ -304,7 +304,7 @@ class TransferRoutine:
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
-        yield from self._do("go home", path, guard=Guard(force=_TOUCH))
+        yield from self._do("go home", path, guard=Guard(force=_BUMP))
         self._under_way = None
         return "", ""
 

@@ -24,7 +24,8 @@ from benchmarks.calibration import (
     write_constants,
 )
 from stages.devices.clutter import COUNTS, Pile
-from stages.perception.confidence.doubt import FEATURES, RIGHT_METRES, Calibration, Evidence
+from stages.perception.confidence.calibration import FEATURES, RIGHT_METRES, Calibration
+from stages.perception.confidence.evidence import Evidence
 from tests.stages.perception.scenes import CATALOGUE
 
 PLAIN = Evidence(

@@ -77,8 +77,8 @@ def test_methods_become_commands_and_unknown_ones_are_refused() -> None:
     digest, icp = (compare.command(method, options, Path("o.csv"))[2:] for method in ("paper", "icp"))
     assert digest[:4] == ["benchmarks.estimate", "d", "noisy", "o.csv"] and digest[4:6] == ["--form", "paper"]
     assert icp == ["benchmarks.baselines", "icp", "d", "noisy", "o.csv", "--dof", "3", "--images", "2"]
-    with pytest.raises(Refused, match=r"'magic' is none of digest, paper, icp"):
-        compare._methods("digest,magic")
+    with pytest.raises(Refused, match=r"'magic' is none of digest, depth, paper, icp"):
+        compare.parse_methods("digest,magic")
 
 
 def test_comparisons_are_written_from_results_that_are_kept(

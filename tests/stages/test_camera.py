@@ -14,10 +14,9 @@ from runner.message import codec
 from runner.recording.writer import RecordingWriter
 from runner.testing import run_stage
 from stages.camera import DatasetCamera, RealSenseCamera, RecordedCamera, SimulatedCamera
-from stages.devices import fetch
-from stages.devices.tabletop import TABLE
 from stages.messages import Frame, Snapshot
 from tests.runner.common.recordings import manifest, put
+from tests.stages.planning.scenes import ROBOT
 
 BUILT_IN = Path(stages.scene.__file__).parent / "catalogue.yaml"
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -28,12 +27,12 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../s
 
 def snapshot() -> Snapshot:
     T = np.eye(4)
-    T[:3, 3] = 0.7, 0.0, TABLE.height + 0.05
+    T[:3, 3] = 0.7, 0.0, ROBOT.table.height + 0.05
     return Snapshot(
         names=("soup_can",),
         T_base_objects=T[None],
-        joint_names=tuple(fetch.HOME),
-        joint_positions=np.array(list(fetch.HOME.values())),
+        joint_names=tuple(ROBOT.posture),
+        joint_positions=np.array(list(ROBOT.posture.values())),
         time=1.5,
         purpose="goal",
     )

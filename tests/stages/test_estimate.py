@@ -9,6 +9,7 @@ import pytest
 
 from runner.contract import Context, Refused
 from stages.estimate import Box, EstimatedScene, estimate_scene
+from stages.geometry.lens import INVERSE, Lens
 from stages.geometry.poses import inverse
 from stages.messages import Candidate, Candidates, Frame
 from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright
@@ -55,6 +56,17 @@ def test_equal_calls_give_equal_bytes(seen: Rendered) -> None:
     for a, b in zip(one.objects, other.objects, strict=True):
         assert (a.name, a.probability) == (b.name, b.probability)
         assert a.T_camera_object.tobytes() == b.T_camera_object.tobytes()
+
+
+def test_a_lens_that_bends_the_image_is_taken_out(seen: Rendered) -> None:
+    lens = (-0.12, 0.03, 0.001, -0.001, 0.0)
+    rgb, depth = Lens(K, seen.scene.depth.shape, lens, INVERSE).straighten(RGB, seen.scene.depth)
+    given = boxes(seen, "mug", "tea_box")
+    found = estimate_scene(rgb, depth, K, CATALOGUE_FILE, boxes=given, dof=3, distortion=lens)
+    for item in found.objects:
+        assert item.T_camera_object[:3, 3] == pytest.approx(seen.poses[item.name][:3, 3], abs=0.004)
+    with pytest.raises(Refused, match="distortion: distortion model 'plumb_bob' does not have 2 coefficients"):
+        estimate_scene(rgb, depth, K, CATALOGUE_FILE, boxes=given, distortion=lens[:2])
 
 
 class One:

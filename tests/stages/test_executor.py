@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from runner.contract import Level, Refused
-from stages.devices import fetch, tabletop
 from stages.devices.simulation import Simulation
 from stages.devices.suites import tray
 from stages.executor import Executor
@@ -28,8 +27,9 @@ from stages.messages import (
 )
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
+from stages.robots import BUILT_IN, read_robot
 from stages.world import World
-from tests.stages.planning.scenes import CATALOGUE_FILE, standing
+from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, standing
 
 
 @dataclass
@@ -46,10 +46,10 @@ class StepContext:
 class Bench:
     """World and executor without a runner between them."""
 
-    def __init__(self, seed: int, goal: str) -> None:
-        self.ctx = StepContext(np.random.default_rng(seed))
-        self.world = World(World.Config(catalogue=CATALOGUE_FILE, seed=seed, goal=goal))
-        self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, attempts=2))
+    def __init__(self, seed: int, goal: str, robot: Path = BUILT_IN) -> None:
+        self.ctx, self.robot = StepContext(np.random.default_rng(seed)), read_robot(robot)
+        self.world = World(World.Config(catalogue=CATALOGUE_FILE, robot=robot, seed=seed, goal=goal))
+        self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, robot=robot, attempts=2))
         self.world.on_arrangement(Arrangement(kind="start"), self.ctx)
         self.meddle: Callable[[str], None] = lambda label: None
         """Called while a command is carried out, with what it is for."""
@@ -67,7 +67,7 @@ class Bench:
         transfer = Transfer(
             object=name, source="table", destination=destination, T_base_targets=target[None], pick="", place=""
         )
-        request = TransferRequest(transfer=transfer, scene=graph(poses), number=1)
+        request = TransferRequest(transfer=transfer, scene=graph(poses, self.robot.table.height), number=1)
         return self.played(self.executor.on_transfer_request(request, self.ctx))
 
     def played(self, answer: RobotCommand | Outcome) -> Outcome:
@@ -88,16 +88,23 @@ class Bench:
     def is_home(self) -> bool:
         state = self.does(READ)
         where = dict(zip(state.joint_names, state.positions, strict=True))
-        return state.gripper_width > 0.09 and all(abs(where[n] - p) < 0.02 for n, p in fetch.HOME.items())
+        is_open = state.gripper_width > 0.9 * self.robot.gripper.open_width
+        return is_open and all(abs(where[n] - p) < 0.02 for n, p in self.robot.posture.items())
 
 
 NONE = np.zeros((0, 8))
 READ = RobotCommand(times=np.zeros(0), positions=NONE, velocities=NONE)
+OTHERS = [
+    BUILT_IN.with_name("ur5e.yaml"),
+    BUILT_IN.with_name("panda.yaml"),
+    Path(__file__).parent / "robots" / "arm.yaml",
+]
+"""Two that come with the package, and one that is a URDF."""
 
 
-def graph(poses: dict[str, Floats]) -> SceneGraph:
+def graph(poses: dict[str, Floats], height: float) -> SceneGraph:
     T_base_table = np.eye(4)
-    T_base_table[2, 3] = tabletop.TABLE.height
+    T_base_table[2, 3] = height
     return SceneGraph(
         objects=tuple(SceneObject(name=name, label=name, T_base_object=T) for name, T in poses.items()),
         virtual_objects=(),
@@ -119,7 +126,7 @@ def misperceived(T: Floats, rng: np.random.Generator) -> Floats:
 @pytest.mark.slow
 def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
     bench, rng = Bench(0, "tea"), np.random.default_rng(1)
-    goal = tray.sample_goal("tea", bench.world._catalogue, rng)  # pyright: ignore[reportPrivateUsage]
+    goal = tray.sample_goal("tea", bench.world._catalogue, ROBOT, rng)  # pyright: ignore[reportPrivateUsage]
     for name, destination in (("tea_box", "tray"), ("soup_can", "tea_box")):
         before = bench.poses()
         perceived = {key: misperceived(T, rng) for key, T in before.items()}
@@ -136,6 +143,19 @@ def test_places_in_the_tray_and_stacks_despite_errors_of_perception() -> None:
         assert all(np.linalg.norm(after[o][:3, 3] - before[o][:3, 3]) < 0.01 for o in others)
         assert bench.is_home()
     assert any("grasped" in line for line in bench.ctx.lines)
+
+
+@pytest.mark.parametrize("robot", OTHERS, ids=lambda robot: robot.stem)
+def test_other_robots_pick_and_place_by_their_descriptions_alone(robot: Path) -> None:
+    bench = Bench(0, "tea", robot)
+    target = standing("sugar_box", 0.34, -0.08, height=bench.robot.table.height)
+    before = bench.poses()
+    outcome = bench.transfer(before, "sugar_box", "table", target)
+    assert outcome.success, outcome.reason
+    after = bench.poses()
+    np.testing.assert_allclose(after["sugar_box"], target, atol=0.01)
+    assert all(np.linalg.norm((after[o] - before[o])[:3, 3]) < 0.01 for o in set(after) - {"sugar_box"})
+    assert bench.is_home()
 
 
 def test_an_unreachable_object_fails_in_ik() -> None:
@@ -210,7 +230,7 @@ def test_a_stop_between_two_motions_is_heard() -> None:
         pick="", place="",
     )  # fmt: skip
     read = bench.executor.on_transfer_request(
-        TransferRequest(transfer=transfer, scene=graph(before), number=1), bench.ctx
+        TransferRequest(transfer=transfer, scene=graph(before, bench.robot.table.height), number=1), bench.ctx
     )
     assert isinstance(read, RobotCommand)
     state = bench.does(read)

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.contract import Refused
-from stages.devices import tabletop
 from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.poses import inverse
@@ -20,6 +19,7 @@ from stages.planning.targets import Workspace
 from stages.scene.stance import Standing, yawed
 from stages.scene.virtual import satisfied
 from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
+from tests.stages.planning.scenes import ROBOT
 
 
 @cache
@@ -140,7 +140,7 @@ def test_what_stands_on_a_goal_object_is_put_aside_and_stays_within_reach():
     found = plan(goal, start)
     assert [t.key for t in found.transfers] == ["soup_can: tea_box -> table", "tuna_can: table -> tea_box"]
     assert reached(goal, executed(start, found))
-    workspace = Workspace()
+    workspace = Workspace().of(ROBOT)
     assert all(workspace.outside(T) < 1e-9 for T in found.transfers[0].T_base_targets)
 
 
@@ -359,11 +359,11 @@ def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     goal, start = (
         Layout({
             item: inverse(T_BASE_TABLE) @ T
-            for item, T in sample(name, catalogue(), np.random.default_rng([104, kind])).items()
+            for item, T in sample(name, catalogue(), ROBOT, np.random.default_rng([104, kind])).items()
         })
         for kind, sample in enumerate((tray.sample_goal, tray.sample_start))
     )  # fmt: skip
-    table = tabletop.TABLE
+    table = ROBOT.table
     corner = np.array(table.center) - T_BASE_TABLE[:2, 3]
     surface = regions.rectangle(corner - np.array(table.size) / 2, corner + np.array(table.size) / 2)
     assert over_the_edge(plan(goal, start), surface) == ["water_bottle: table -> table"]

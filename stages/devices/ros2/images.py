@@ -1,4 +1,4 @@
-"""Pixels of ROS 2 images: colour as bytes, depth in metres, lenses taken out.
+"""Pixels of ROS 2 images: colour as bytes, depth in metres, and what a CameraInfo says of them.
 
 Encodings: sensor_msgs/image_encodings.hpp; compressed depth: compressed_depth_image_transport; RVL: Wilson, Fast
 Lossless Depth Image Compression (2017). What cannot be read raises ValueError, with the encoding that was found.
@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.lens import PLUMB_BOB, Lens
 from stages.messages.arrays import Depth, Intrinsics, Rgb
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _COLORS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
 """By encoding: channels, and where red, green and blue are."""
 _DEPTHS = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
-_FISHEYE = "equidistant"
-_LENSES = ("plumb_bob", "rational_polynomial", _FISHEYE)
 _DEPTH_HEADER = struct.Struct("<iff")
 _RVL_HEADER = struct.Struct("<II")
 
@@ -45,33 +44,17 @@ def depth(message: Any) -> Depth:
     return _metres(_rows(message, _DEPTHS[message.encoding], 1)[:, :, 0])
 
 
-class Lens:
-    """What a CameraInfo says: the pinhole matrix of rectified pixels, and how to get these."""
+def pinhole(info: Any, *, rectified: bool) -> Intrinsics:
+    """The matrix of a CameraInfo for images that are ``rectified`` or not; ValueError without a focal length."""
+    K = np.array(np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3)), np.float64)
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError("no focal length: the camera is not calibrated")
+    return K
 
-    def __init__(self, info: Any, *, rectified: bool) -> None:
-        """``rectified`` says that the images are so already. Raises ValueError for a lens of unknown kind."""
-        self.size = (int(info.height), int(info.width))
-        pinhole = np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3))
-        self.K: Intrinsics = np.array(pinhole, np.float64)
-        if not (self.K[0, 0] > 0 and self.K[1, 1] > 0):
-            raise ValueError("no focal length: the camera is not calibrated")
-        self._maps = None if rectified or not np.any(info.d) else self._bent(info)
 
-    def straighten(self, rgb: Rgb, metres: Depth) -> tuple[Rgb, Depth]:
-        """Colour and depth as a pinhole camera of matrix K sees them; 0 beyond their rims."""
-        if self._maps is None:
-            return rgb, metres
-        return (
-            np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), np.uint8),
-            np.asarray(cv2.remap(metres, *self._maps, cv2.INTER_NEAREST), np.float32),
-        )
-
-    def _bent(self, info: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-        if info.distortion_model not in _LENSES:
-            raise ValueError(f"distortion model {info.distortion_model!r} is not known; valid: {', '.join(_LENSES)}")
-        undistort: Any = cv2.fisheye if info.distortion_model == _FISHEYE else cv2
-        size = self.size[::-1]
-        return undistort.initUndistortRectifyMap(self.K, np.array(info.d), np.eye(3), self.K, size, cv2.CV_32FC1)
+def lens(info: Any, K: Intrinsics, *, rectified: bool) -> Lens:
+    """The lens that is left in the images; ValueError where it is of unknown kind."""
+    return Lens(K, (int(info.height), int(info.width)), () if rectified else info.d, info.distortion_model or PLUMB_BOB)
 
 
 def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.devices.ros2.images import COMPRESSED, IMAGE, Lens, color, depth
+from stages.devices.ros2.images import COMPRESSED, IMAGE, color, depth, lens, pinhole
 from stages.devices.ros2.settings import Source
 from stages.devices.ros2.transforms import NoTransform, Transforms
 from stages.messages import Frame
@@ -64,7 +64,8 @@ def frame_of(
     source: Source, pair: Pair, info: Any, transforms: Transforms, *, name: str, index: int, total: int
 ) -> Frame:
     """One look; raises :class:`Unusable` naming what is wrong."""
-    lens = _read(source.info, lambda: Lens(info, rectified=source.rectified))
+    K = _read(source.info, lambda: pinhole(info, rectified=source.rectified))
+    bent = _read(source.info, lambda: lens(info, K, rectified=source.rectified))
     rgb = _read(source.color, lambda: color(pair.color))
     metres = _read(source.depth, lambda: depth(pair.depth))
     if rgb.shape[:2] != metres.shape:
@@ -72,13 +73,13 @@ def frame_of(
             f"{source.depth}: {_size(metres)} pixels, but {source.color} has {_size(rgb)}; depth must be registered to "
             "colour"
         )
-    if lens.size != metres.shape:
-        raise Unusable(f"{source.info}: speaks of {lens.size[1]} x {lens.size[0]} pixels, the image has {_size(rgb)}")
-    rgb, metres = lens.straighten(rgb, metres)
+    if (info.height, info.width) != metres.shape:
+        raise Unusable(f"{source.info}: speaks of {info.width} x {info.height} pixels, the image has {_size(rgb)}")
+    rgb, metres = bent.straighten(rgb, metres)
     return Frame(
         rgb=rgb,
         depth=metres,
-        K=lens.K,
+        K=K,
         T_base_camera=camera_pose(source, pair.color.header.frame_id, pair.stamp_ns, transforms),
         robot_mask=None,
         name=name,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.devices import fetch
 from stages.devices.suites.draft import Draft
 from stages.devices.suites.suite import Drawn, Kind, graspable, put_somewhere
 from stages.devices.suites.wild import FIXED
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose
 from stages.messages import SensorErrors
-from stages.planning.collision import Table
+from stages.robots import Table
 
 _DEPTH = (0.01, 0.02)
 """Share by which all depths are too long or too short."""
@@ -30,16 +29,18 @@ class Biased(Drawn):
         """The objects, the table and what is wrong."""
         fixed = [FIXED[0]] if rng.random() < 0.5 else []
         self.names = (*fixed, *rng.permutation(graspable(self.catalogue)).tolist()[: int(rng.integers(5, 8))])
+        x, height = self.table.center[0] - 0.80, self.table.height - 0.70
         depth, front = float(rng.uniform(0.55, 0.85)), float(rng.uniform(0.40, 0.48))
         self.table = Table(
-            center=(front + depth / 2, float(rng.uniform(-0.05, 0.05))),
+            center=(x + front + depth / 2, float(rng.uniform(-0.05, 0.05))),
             size=(depth, float(rng.uniform(1.0, 1.4))),
-            height=float(rng.uniform(0.66, 0.74)),
+            height=height + float(rng.uniform(0.66, 0.74)),
         )
         self._depth = 1 + float(rng.choice((-1, 1)) * rng.uniform(*_DEPTH))
         self._T_believed_true = pose(exp_so3(_EXTRINSICS[1] * _direction(rng)), _EXTRINSICS[0] * _direction(rng))
         self._T_color_depth = pose(exp_so3(np.append(rng.uniform(-1, 1, 2), 0) * _REGISTRATION), np.zeros(3))
-        turning = np.array([name not in ("torso_lift_joint", *fetch.FINGER_JOINTS) for name in fetch.JOINT_NAMES])
+        posture, body = self.robot.posture, self.robot.body
+        turning = np.array([name in posture and body.turns(name) for name in self.robot.joint_names])
         self._joints = turning * rng.uniform(-_JOINTS, _JOINTS, len(turning))
 
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.devices import fetch
 from stages.devices.simulation import Simulation
 from stages.devices.suites.draft import Draft
 from stages.devices.suites.placing import upright
@@ -97,9 +96,9 @@ class Disturbed(Drawn):
             x, y, yaw = self._rng.uniform((_NEAR, -_WIDE, -np.pi), (_FAR, _WIDE, np.pi)).tolist()
             T = upright(entry, x, y, yaw, self.table.height)
             item = Standing.at(name, self._shapes[label_of(name, self.catalogue)], T)
-            reach = np.hypot(x - fetch.SHOULDER[0], y - fetch.SHOULDER[1])
+            reach = np.hypot(x - self.robot.shoulder[0], y - self.robot.shoulder[1])
             hand = np.linalg.norm(simulation.hand()[:2] - (x, y))
-            if reach > _REACH or hand < _HAND or not is_seen([*loose, (entry, T)]):
+            if reach > _REACH or hand < _HAND or not is_seen(self.robot, [*loose, (entry, T)]):
                 continue
             if all(regions.separation(item.outline, other.outline) > _ROOM for other in others):
                 simulation.add(name, T)

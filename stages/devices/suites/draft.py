@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from stages.devices import fetch, tabletop
+from stages.devices import tabletop
 from stages.devices.tabletop import Layout
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.regions import Region
-from stages.planning.collision import Table
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
 from stages.scene.relations import TABLE
 from stages.scene.scoring import label_of
@@ -25,8 +25,8 @@ _MARGIN = 0.02
 """Metres from the table's edge that the robot keeps too."""
 _MIDDLE = 0.01
 """Metres from the edge of what carries it at which the middle of an object stands, at least."""
-_REACH = 0.75
-"""Metres around the robot's shoulder beyond which nothing is drawn; what lies within may still be out of reach."""
+_BEYOND = 0.03
+"""Metres beyond the robot's reach within which things are drawn; what lies there may be out of reach."""
 _TRIES = 30
 _HIGHEST = 3
 """Objects in a stack."""
@@ -44,10 +44,18 @@ class Draft:
     """Objects that stand where they were put, in the base frame, and what carries each of them."""
 
     def __init__(
-        self, catalogue: Catalogue, shapes: Shapes, rng: np.random.Generator, table: Table, hidden: float
+        self,
+        catalogue: Catalogue,
+        shapes: Shapes,
+        rng: np.random.Generator,
+        *,
+        robot: Robot,
+        table: Table,
+        hidden: float,
     ) -> None:
         """``hidden``: the largest share of an object that others may hide from the camera."""
-        self._catalogue, self._shapes, self._rng, self._table, self._hidden = catalogue, shapes, rng, table, hidden
+        self._catalogue, self._shapes, self._rng, self._robot = catalogue, shapes, rng, robot
+        self._table, self._hidden = table, hidden
         low, high = (np.array(table.center) + side * np.array(table.size) / 2 for side in (-1, 1))
         self._surface = regions.rectangle(low.tolist(), high.tolist())
         self.placed: dict[str, Standing] = {}
@@ -131,7 +139,7 @@ class Draft:
 
     def _is_carried(self, item: Standing, support: str) -> bool:
         """Wholly over the table or a hollow's floor, by its middle on a top; and not far beyond the robot's reach."""
-        if np.linalg.norm(item.T_table_stance[:2, 3] - fetch.SHOULDER) > _REACH:
+        if np.linalg.norm(item.T_table_stance[:2, 3] - self._robot.shoulder) > self._robot.reach + _BEYOND:
             return False
         surface = self._surface_of(support)
         if support == TABLE:
@@ -154,9 +162,11 @@ class Draft:
         return set() if support == TABLE else {support, *self._below(self.supports[support])}
 
     def _is_seen(self) -> bool:
-        """Whether all of it lies in the head camera's image and nothing hides too much of another thing.
+        """Whether all of it lies in the camera's image and nothing hides too much of another thing.
 
         What cannot be moved carries others, and is seen between them.
         """
         loose = [item for item in self.placed.values() if item.stance.item.grasps]
-        return not loose or tabletop.is_seen([(i.stance.item, i.T_table_object) for i in loose], self._hidden)
+        return not loose or tabletop.is_seen(
+            self._robot, [(i.stance.item, i.T_table_object) for i in loose], self._hidden
+        )

@@ -9,7 +9,7 @@ import numpy as np
 from stages.devices.suites.draft import APART, Draft
 from stages.devices.suites.suite import Drawn, Kind, Rejected, graspable, put, put_somewhere
 from stages.devices.suites.wild import FIXED
-from stages.devices.tabletop import HIDDEN, T_camera_base
+from stages.devices.tabletop import HIDDEN
 from stages.geometry.poses import inverse
 
 _TALL = ("cereal_box", "milk_carton", "sugar_box")
@@ -50,7 +50,7 @@ class Hidden(Drawn):
     def _hide(self, draft: Draft, name: str, rng: np.random.Generator) -> None:
         """Straight behind the other one, as the camera sees it, nearly touching it or a little apart."""
         hider = draft.placed[self._behind[name]].T_table_stance[:2, 3]
-        away = hider - inverse(T_camera_base())[:2, 3]
+        away = hider - inverse(self.robot.T_camera_base)[:2, 3]
         away /= np.linalg.norm(away)
         for distance in np.arange(0.04, 0.16, 0.005):
             place = hider + (distance + rng.uniform(0, 0.02)) * away

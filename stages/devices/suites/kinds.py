@@ -13,6 +13,7 @@ from stages.devices.suites.suite import Drawn, Suite
 from stages.devices.suites.swap import Swap
 from stages.devices.suites.twins import Twins
 from stages.devices.suites.wild import Wild
+from stages.robots import Robot
 from stages.scene.catalogue import Catalogue
 
 TRAY = "tray"
@@ -40,6 +41,6 @@ def check(name: str, goal: str, seed: int) -> None:
         raise Refused(f"world.goal: suite {name} draws its goals; {goal!r} is a goal of suite {TRAY}")
 
 
-def suite(name: str, catalogue: Catalogue, seed: int, *, goal: str = "auto") -> Suite:
+def suite(name: str, catalogue: Catalogue, robot: Robot, seed: int, *, goal: str = "auto") -> Suite:
     """The world of a suite that a seed draws."""
-    return tray.Tray(catalogue, seed, goal) if name == TRAY else DRAWN[name](catalogue, seed)
+    return tray.Tray(catalogue, robot, seed, goal) if name == TRAY else DRAWN[name](catalogue, robot, seed)

@@ -9,7 +9,7 @@ import numpy as np
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
-from stages.planning.collision import Table
+from stages.robots import Table
 from stages.scene.catalogue import Catalogue, CatalogueObject, Primitive
 from stages.scene.scoring import label_of
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
-from stages.devices.tabletop import HIDDEN, TABLE, Layout
+from stages.devices.tabletop import HIDDEN, Layout
 from stages.messages import SensorErrors
+from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
 
 Kind = Literal["goal", "start"]
@@ -27,7 +28,7 @@ class Suite(ABC):
 
     names: tuple[str, ...]
     """All objects that any scene has; a scene may do without some."""
-    table = TABLE
+    table: Table
 
     factors: Mapping[str, Factors] = MappingProxyType({})
     """Objects that are not as the catalogue has them."""
@@ -58,8 +59,8 @@ class Drawn(Suite):
     hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 0.8}
     """Largest share of an object that others hide from the camera. What nobody sees cannot be shown as a goal."""
 
-    def __init__(self, catalogue: Catalogue, seed: int) -> None:
-        self.catalogue, self._shapes = catalogue, shapes(catalogue)
+    def __init__(self, catalogue: Catalogue, robot: Robot, seed: int) -> None:
+        self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
         self.choose(np.random.default_rng([seed, 2]))
 
     @abstractmethod
@@ -79,9 +80,9 @@ class Drawn(Suite):
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.devices.suites.reach import stuck
 
-        draft = Draft(self.catalogue, self._shapes, rng, self.table, self.hidden[kind])
+        draft = Draft(self.catalogue, self._shapes, rng, robot=self.robot, table=self.table, hidden=self.hidden[kind])
         self.draw(kind, draft, rng)
-        if stuck(draft.placed, draft.supports, self.table) - self.stubborn(kind):
+        if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
         return draft.layout
 

@@ -1,4 +1,4 @@
-"""The suite ``tray``: four goals written by hand, five objects on and around a tray, upright and apart."""
+"""The suite ``tray``: five goals written by hand, five objects on and around a tray, upright and apart."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from itertools import combinations, permutations
 import numpy as np
 
 from runner.contract import Refused
-from stages.devices import fetch
 from stages.devices.suites.placing import support_height, upright
 from stages.devices.suites.suite import Kind, Suite
-from stages.devices.tabletop import TABLE, Layout, image_rectangle, is_inside_image, is_seen
+from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
+from stages.robots import Robot
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
 TRAY = "tray"
 
+_MIDDLE = (0.80, 0.0)
+"""The scenes are written for a table whose middle is here, and shifted to where the robot's is; metres."""
 _NEAR, _FAR = 0.52, 0.80
-"""Metres in front of the robot between which objects stand."""
-_REACH = 0.72
-"""Metres around the shoulder-pan axis within which objects are grasped and placed from the top."""
+"""Between these objects stand."""
 _APART = 0.04
 """Metres between objects that are not placed together: room for a finger."""
 _STACKED_SHARE = 0.3
@@ -74,8 +74,17 @@ GOALS: dict[str, tuple[Spot, ...]] = {
         Spot("salt_shaker", "tea_box"),
         Spot("tuna_can", TRAY, x=0.120),
     ),
+    "supper": (
+        Spot("cup", TRAY, x=-0.120),
+        Spot("salt_shaker", TRAY, x=0.0),
+        Spot("tuna_can", TRAY, x=0.110),
+        Spot("sugar_box", "table"),
+        Spot("water_bottle", "table", y=0.105, beside="sugar_box"),
+    ),
 }
 """Goal scenes by name. Neighbours stand 3 cm apart, in line with neither's fingers."""
+_BY_SEED = ("tea", "breakfast", "lunch", "snack")
+"""Those that ``auto`` chooses from: a seed keeps its world."""
 
 
 def goal_name(goal: str, seed: int) -> str:
@@ -85,7 +94,7 @@ def goal_name(goal: str, seed: int) -> str:
         Refused: no such template.
     """
     if goal == "auto":
-        return tuple(GOALS)[seed % len(GOALS)]
+        return _BY_SEED[seed % len(_BY_SEED)]
     if goal not in GOALS:
         raise Refused(f"world.goal: no goal scene {goal!r}; choose auto or one of {', '.join(GOALS)}")
     return goal
@@ -99,29 +108,30 @@ def object_names(goal: str) -> tuple[str, ...]:
 class Tray(Suite):
     """One of the goals, chosen by name or by the seed; the objects apart on the table as start."""
 
-    def __init__(self, catalogue: Catalogue, seed: int, goal: str = "auto") -> None:
-        self._catalogue, self._goal = catalogue, goal_name(goal, seed)
+    def __init__(self, catalogue: Catalogue, robot: Robot, seed: int, goal: str = "auto") -> None:
+        self._catalogue, self._robot, self._goal = catalogue, robot, goal_name(goal, seed)
+        self.table = robot.table
         self.names = object_names(self._goal)
 
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """A scene of the goal."""
-        return (sample_goal if kind == "goal" else sample_start)(self._goal, self._catalogue, rng)
+        return (sample_goal if kind == "goal" else sample_start)(self._goal, self._catalogue, self._robot, rng)
 
 
-def sample_goal(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout:
+def sample_goal(goal: str, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Layout:
     """Draws the tray's place and the free places of a goal template until everything is reachable and seen."""
     together = {frozenset((spot.name, spot.beside)) for spot in GOALS[goal] if spot.beside}
     for _ in range(_ATTEMPTS):
-        layout = {TRAY: _tray_pose(catalogue, rng)}
+        layout = {TRAY: _tray_pose(catalogue, robot, rng)}
         for spot in GOALS[goal]:
-            layout[spot.name] = _spot_pose(spot, layout, catalogue, rng)
+            layout[spot.name] = _spot_pose(spot, layout, catalogue, robot, rng)
         standing = [TRAY, *(spot.name for spot in GOALS[goal] if spot.support == "table")]
-        if _is_good(layout, standing, together, catalogue):
+        if _is_good(layout, standing, together, catalogue, robot):
             return layout
     raise RuntimeError(f"no room for the goal scene {goal}")
 
 
-def sample_start(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout:
+def sample_start(goal: str, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Layout:
     """Draws a start scene for the objects of a goal template: the tray elsewhere, the others apart on the table.
 
     Some scenes contain a stack that the goal does not have.
@@ -129,43 +139,49 @@ def sample_start(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> L
     stack = _wrong_stack(goal, catalogue, rng)
     names = [name for name in object_names(goal) if stack is None or name != stack[0]]
     for _ in range(_ATTEMPTS):
-        layout = _scatter(names, goal, catalogue, rng)
+        layout = _scatter(names, goal, catalogue, robot, rng)
         if layout is None:
             continue
         if stack is not None:
             upper, lower = stack
-            layout[upper] = _spot_pose(Spot(upper, lower, yaw=rng.uniform(0, 360)), layout, catalogue, rng)
-        if _is_good(layout, names, set(), catalogue):
+            layout[upper] = _spot_pose(Spot(upper, lower, yaw=rng.uniform(0, 360)), layout, catalogue, robot, rng)
+        if _is_good(layout, names, set(), catalogue, robot):
             return layout
     raise RuntimeError(f"no room for a start scene of {', '.join(names)}")
 
 
-def _scatter(names: list[str], goal: str, catalogue: Catalogue, rng: np.random.Generator) -> Layout | None:
+def _scatter(
+    names: list[str], goal: str, catalogue: Catalogue, robot: Robot, rng: np.random.Generator
+) -> Layout | None:
     """Places one object after the other where it keeps its distance; None where the table is too full."""
     layout: Layout = {}
     for name in names:
         for _ in range(60):
-            T = _tray_pose(catalogue, rng) if name == TRAY else _free_pose(catalogue[name], rng)
+            T = _tray_pose(catalogue, robot, rng) if name == TRAY else _free_pose(catalogue[name], robot, rng)
             layout[name] = T
-            if _fits(name, layout, goal, catalogue):
+            if _fits(name, layout, goal, catalogue, robot):
                 break
         else:
             return None
     return layout
 
 
-def _fits(name: str, layout: Layout, goal: str, catalogue: Catalogue) -> bool:
+def _fits(name: str, layout: Layout, goal: str, catalogue: Catalogue, robot: Robot) -> bool:
     """The object is in reach (of the tray: what the goal puts into it), in view and apart from all others."""
     T, entry = layout[name], catalogue[name]
-    if not (_can_be_filled(T, goal) if name == TRAY else _reachable(T) and is_inside_image(image_rectangle(entry, T))):
+    if name == TRAY:
+        fits = _can_be_filled(T, goal, robot)
+    else:
+        fits = _reachable(T, robot) and is_inside_image(robot, image_rectangle(robot, entry, T))
+    if not fits:
         return False
     return all(_gap(name, other, layout, catalogue) >= _APART for other in layout if other != name)
 
 
-def _can_be_filled(T_base_tray: Floats, goal: str) -> bool:
+def _can_be_filled(T_base_tray: Floats, goal: str, robot: Robot) -> bool:
     """Every place in the tray that the goal uses is in reach."""
     spots = [spot for spot in GOALS[goal] if spot.support == TRAY]
-    return all(_reachable(T_base_tray @ pose(np.eye(3), np.array([spot.x, spot.y, 0.0]))) for spot in spots)
+    return all(_reachable(T_base_tray @ pose(np.eye(3), np.array([spot.x, spot.y, 0.0])), robot) for spot in spots)
 
 
 def _wrong_stack(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> tuple[str, str] | None:
@@ -185,48 +201,61 @@ def _stands_on(upper: str, lower: str, catalogue: Catalogue) -> bool:
     return bool(flat and low and above.dimensions[:2].max() <= 1.1 * below.dimensions[:2].min())
 
 
-def _tray_pose(catalogue: Catalogue, rng: np.random.Generator) -> Floats:
+def _tray_pose(catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Floats:
     """The tray to the left or right of the middle, its long side roughly along the table's edge."""
     y = rng.choice([-1, 1]) * rng.uniform(0.14, 0.25)
-    return upright(catalogue[TRAY], rng.uniform(0.63, 0.68), y, np.deg2rad(90 + rng.uniform(-12, 12)), TABLE.height)
+    x, yaw = rng.uniform(0.63, 0.68), np.deg2rad(90 + rng.uniform(-12, 12))
+    return _on_table(catalogue[TRAY], x, y, yaw, robot)
 
 
-def _free_pose(entry: CatalogueObject, rng: np.random.Generator) -> Floats:
+def _free_pose(entry: CatalogueObject, robot: Robot, rng: np.random.Generator) -> Floats:
     x, y = rng.uniform(_NEAR, _FAR), rng.uniform(-0.45, 0.45)
-    return upright(entry, x, y, rng.uniform(-np.pi, np.pi), TABLE.height)
+    return _on_table(entry, x, y, rng.uniform(-np.pi, np.pi), robot)
 
 
-def _spot_pose(spot: Spot, layout: Layout, catalogue: Catalogue, rng: np.random.Generator) -> Floats:
+def _on_table(entry: CatalogueObject, x: float, y: float, yaw: float, robot: Robot) -> Floats:
+    dx, dy = _shift(robot)
+    return upright(entry, x + dx, y + dy, yaw, robot.table.height)
+
+
+def _shift(robot: Robot) -> Floats:
+    return np.subtract(robot.table.center, _MIDDLE)
+
+
+def _spot_pose(spot: Spot, layout: Layout, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Floats:
     entry = catalogue[spot.name]
     reference = spot.beside or spot.support
     if reference == "table":
-        return _free_pose(entry, rng)
+        return _free_pose(entry, robot, rng)
     T = layout[reference]
     x, y = (T @ [spot.x, spot.y, 0, 1])[:2]
     yaw = np.arctan2(T[1, 0], T[0, 0]) + np.deg2rad(spot.yaw)
-    return upright(entry, x, y, yaw, _height_at(spot.support, x, y, layout, catalogue))
+    return upright(entry, x, y, yaw, _height_at(spot.support, np.array([x, y]), layout, catalogue, robot))
 
 
-def _height_at(support: str, x: float, y: float, layout: Layout, catalogue: Catalogue) -> float:
-    """Height of the upper surface of ``support`` at (x, y) in the base frame, metres."""
+def _height_at(support: str, place: Floats, layout: Layout, catalogue: Catalogue, robot: Robot) -> float:
+    """Height of the upper surface of ``support`` at a place (x, y) of the base frame, metres."""
     if support == "table":
-        return TABLE.height
+        return robot.table.height
     T = layout[support]
-    local = inverse(T) @ [x, y, 0, 1]
+    local = inverse(T) @ [*place, 0, 1]
     return float(T[2, 3] + support_height(catalogue[support], local[0], local[1]))
 
 
-def _is_good(layout: Layout, standing: Iterable[str], together: set[frozenset[str]], catalogue: Catalogue) -> bool:
+def _is_good(
+    layout: Layout, standing: Iterable[str], together: set[frozenset[str]], catalogue: Catalogue, robot: Robot
+) -> bool:
     """Everything but the tray in reach, all of it in view, and what stands on the table apart."""
-    reach = all(_reachable(T) for name, T in layout.items() if name != TRAY)
+    reach = all(_reachable(T, robot) for name, T in layout.items() if name != TRAY)
     apart = all(
         frozenset(pair) in together or _gap(*pair, layout, catalogue) >= _APART for pair in combinations(standing, 2)
     )
-    return reach and apart and is_seen([(catalogue[name], T) for name, T in layout.items() if name != TRAY])
+    return reach and apart and is_seen(robot, [(catalogue[name], T) for name, T in layout.items() if name != TRAY])
 
 
-def _reachable(T: Floats) -> bool:
-    return bool(np.linalg.norm(T[:2, 3] - fetch.SHOULDER) <= _REACH and _NEAR <= T[0, 3] <= _FAR)
+def _reachable(T: Floats, robot: Robot) -> bool:
+    x = T[0, 3] - _shift(robot)[0]
+    return bool(np.linalg.norm(T[:2, 3] - robot.shoulder) <= robot.reach and _NEAR <= x <= _FAR)
 
 
 def _gap(a: str, b: str, layout: Layout, catalogue: Catalogue) -> float:

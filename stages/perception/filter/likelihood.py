@@ -23,6 +23,8 @@ from stages.scene.catalogue import Mesh
 
 _STRAY = 4.0
 """A centre one apparent diameter outside costs so many times what the window costs without the object."""
+_FAR = 10.0
+"""Where no surface is, one is taken to be this far away, metres: a renderer's far plane."""
 _SLACK = 0.1
 """Apparent diameters that a detector's box may be off by."""
 
@@ -173,10 +175,8 @@ def credits(
     scene: ObservedScene, background: Float32s, form: CostForm, part: tuple[slice, slice] = np.s_[:, :]
 ) -> Float32s:
     """What each pixel of a part costs with the background alone, metres: what an object gains by explaining it."""
-    inverse, factor = background[part], scene.factor[part]
-    known = inverse > 0
-    behind = 1.0 / np.where(known, inverse, 1.0) - scene.depth[part]
-    miss = np.where(known, factor * behind, form.truncation * (factor > 0))
+    behind = 1.0 / np.maximum(background[part], 1 / _FAR) - scene.depth[part]
+    miss = scene.factor[part] * behind
     if form.plain:
         return np.abs(miss).astype(np.float32)
     # Only readings in front of the background ask for an explanation; the plane's own noise does not.

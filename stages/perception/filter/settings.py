@@ -42,6 +42,7 @@ class FilterSettings:
     coarse_pixels: float | None = 36.0
     """Apparent diameter in the first half of the iterations; None looks at full detail all the time."""
     fine_pixels: float = 60.0
+    """Apparent diameter in the second half."""
     fine_truncation: float | None = 0.015
     """Bound per pixel in the second half, metres; None keeps that of ``cost``."""
     schedule: int | None = 32
@@ -94,6 +95,7 @@ IMPROVEMENTS: dict[str, dict[str, Any]] = {
     "adaptive scale": {"lambda_r": 1.0},
     "flips": {"flips": 0.0},
     "coarse to fine": {"coarse_pixels": None},
+    "resolution": {"fine_pixels": np.inf},
     "truncation": {"fine_truncation": None},
     "re-initialisation": {"renewed": 0.0},
     "elitism": {"elitism": False},

@@ -19,6 +19,7 @@ FRICTION = 0.8
 _GREY = (170, 170, 170)
 _SPECIFIC_MASS = 300.0
 """Kilogrammes per cubic metre of the enclosing box: typical of packaged food and crockery."""
+_LONGEST_PATH = 4096
 _SYMMETRY_KEYS = ("symmetries_discrete", "symmetries_continuous", "near_symmetries_discrete")
 
 
@@ -28,11 +29,20 @@ def read_objects(path: Path) -> dict[str, CatalogueObject]:
     Raises:
         Refused: naming file, line, object, key and valid choices.
     """
-    if path.is_dir():
-        return _read_bop(path / "models_info.json")
+    folder = _written_link(path) or path
+    if folder.is_dir():
+        return _read_bop(folder / "models_info.json")
     if not path.is_file():
         raise Refused(f"{path}: no such catalogue; it is a YAML file or a BOP models folder")
     return _read_yaml(path)
+
+
+def _written_link(path: Path) -> Path | None:
+    """The folder that a file names by all that it holds: so git writes a link where it may not make one."""
+    if path.suffix or not path.is_file() or path.stat().st_size > _LONGEST_PATH:
+        return None
+    target = path.parent / path.read_text(errors="replace").strip()
+    return target if target.is_dir() else None
 
 
 def read_mesh(path: Path, scale: float) -> Mesh:

@@ -7,23 +7,26 @@ import numpy as np
 import pytest
 
 import stages.scene
-from stages.devices import fetch
-from stages.devices.simulated_camera import HEIGHT, ROBOT_MARGIN, WIDTH, K, SimulatedCamera, robot_pixels
-from stages.devices.tabletop import TABLE
+from stages.devices.simulated_camera import ROBOT_MARGIN, SimulatedCamera, robot_pixels
 from stages.geometry.arrays import Floats
 from stages.geometry.camera import project, rays
 from stages.messages import Snapshot
 from stages.scene.catalogue import Catalogue
+from tests.stages.planning.scenes import ROBOT, TABLE
 
 CATALOGUE = Catalogue.load(Path(stages.scene.__file__).parent / "catalogue.yaml")
-FORWARD = dict(zip(fetch.ARM_JOINTS, (0.30, 0.0, -0.2, 0.0, 0.9, 0.0, 0.8, 0.0), strict=True))
+FORWARD = dict(zip(ROBOT.joints, (0.30, 0.0, -0.2, 0.0, 0.9, 0.0, 0.8, 0.0), strict=True))
 
 
 @pytest.fixture(scope="module")
 def camera() -> Iterator[SimulatedCamera]:
-    camera = SimulatedCamera(CATALOGUE)
+    camera = SimulatedCamera(CATALOGUE, ROBOT)
     yield camera
     camera.close()
+
+
+K = ROBOT.camera.K
+WIDTH, HEIGHT = ROBOT.camera.size
 
 
 def standing(name: str, x: float, y: float) -> Floats:
@@ -33,7 +36,7 @@ def standing(name: str, x: float, y: float) -> Floats:
 
 
 def snapshot(joints: dict[str, float] | None = None, **places: tuple[float, float]) -> Snapshot:
-    posture = {**fetch.HOME, **(joints or {})}
+    posture = {**ROBOT.posture, **(joints or {})}
     return Snapshot(
         names=tuple(places),
         T_base_objects=np.array([standing(name, *place) for name, place in places.items()]).reshape(-1, 4, 4),
@@ -44,7 +47,7 @@ def snapshot(joints: dict[str, float] | None = None, **places: tuple[float, floa
 
 
 def camera_pose(scene: Snapshot) -> Floats:
-    return fetch.camera_pose(scene.joint_names, scene.joint_positions)
+    return ROBOT.camera_pose(scene.joint_names, scene.joint_positions)
 
 
 def table_depth(T_base_camera: Floats) -> tuple[np.ndarray, np.ndarray]:

@@ -8,20 +8,19 @@ from msgspec.structs import replace
 
 from runner.contract import Refused
 from runner.testing import run_stage
-from stages.devices import fetch
 from stages.devices.servo import PIECE
 from stages.devices.simulated_camera import SimulatedCamera
 from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.suites.reach import stuck
-from stages.devices.tabletop import HIDDEN, TABLE
+from stages.devices.tabletop import HIDDEN
 from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.relations import Tolerances, supports
 from stages.scene.stance import Standing
 from stages.world import World
-from tests.stages.planning.scenes import catalogue
+from tests.stages.planning.scenes import ROBOT, TABLE, catalogue
 
 CATALOGUE = Catalogue.shared(BUILT_IN)
 
@@ -86,8 +85,8 @@ def test_biased_cameras_see_something_else_than_they_say() -> None:
     assert 0.01 <= abs(goal.errors.depth - 1) <= 0.02
     assert (goal.errors.gains != start.errors.gains).all() and (goal.errors.joints == start.errors.joints).all()
     assert goal.T_base_table is not None and abs(goal.T_base_table[2, 3] - TABLE.height) > 0.001
-    camera = SimulatedCamera(CATALOGUE)
-    T_base_camera = fetch.camera_pose(goal.joint_names, goal.joint_positions)
+    camera = SimulatedCamera(CATALOGUE, ROBOT)
+    T_base_camera = ROBOT.camera_pose(goal.joint_names, goal.joint_positions)
     _, depth = camera.image(goal, T_base_camera)
     camera.close()
     behind = T_base_camera[2, 3] - goal.T_base_table[2, 3]
@@ -100,15 +99,15 @@ def test_biased_joints_go_where_they_are_told_by_their_encoders() -> None:
     world = World(World.Config(suite="biased", seed=0))
     read = RobotCommand(times=np.zeros(0), positions=np.zeros((0, 8)), velocities=np.zeros((0, 8)))
     states = [found for found in run_stage(world, [Arrangement(kind="goal"), read]) if isinstance(found, RobotState)]
-    off = states[-1].positions - [*fetch.HOME.values(), *states[-1].positions[-2:]]
+    off = states[-1].positions - [*ROBOT.posture.values(), *states[-1].positions[-2:]]
     assert 0.0005 < np.abs(off[1:8]).max() < np.deg2rad(0.3) + 0.001
 
 
 def test_hidden_objects_are_in_the_goal_and_behind_others_at_the_start() -> None:
     goal, start, _ = looks("hidden", 0)
     assert set(goal.names) == set(start.names)
-    camera = SimulatedCamera(CATALOGUE)
-    T_base_camera = fetch.camera_pose(start.joint_names, start.joint_positions)
+    camera = SimulatedCamera(CATALOGUE, ROBOT)
+    T_base_camera = ROBOT.camera_pose(start.joint_names, start.joint_positions)
 
     def least_seen(shown: Snapshot) -> float:
         """Smallest share of an object's pixels that no other one hides."""
@@ -129,12 +128,12 @@ def test_fallen_objects_lie_at_the_start_only() -> None:
 
 
 def test_what_stands_where_no_hand_fits_is_stuck() -> None:
-    draft = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), TABLE, HIDDEN)
+    draft = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=HIDDEN)
     assert draft.put_at("mug", "table", np.array([0.6, 0.0]), 0.0)
     assert draft.put_at("soup_can", "table", np.array([0.6, -0.2]), 0.0)
-    assert stuck(draft.placed, draft.supports, TABLE) == set()
+    assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == set()
     assert draft.put_at("salt_shaker", "mug", draft.placed["mug"].floor.mean(0), 0.0)
-    assert stuck(draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
+    assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
 
 
 def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
@@ -164,7 +163,7 @@ def test_somebody_brings_moves_and_returns_objects_while_the_robot_works() -> No
 
 
 def test_slippery_objects_are_not_as_the_catalogue_has_them_and_fall_from_the_hand() -> None:
-    world = kinds.suite("slippery", CATALOGUE, 0)
+    world = kinds.suite("slippery", CATALOGUE, ROBOT, 0)
     factors = [value for one in world.factors.values() for value in (one.mass, one.friction)]
     assert min(factors) >= 0.5 and max(factors) <= 1.5 and np.ptp(factors) > 0.3
 

@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.devices import fetch, tabletop
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld
+from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 
 CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"
+ROBOT = read_robot(BUILT_IN)
+TABLE = ROBOT.table
 
 
 @lru_cache(maxsize=1)
@@ -19,7 +21,7 @@ def catalogue() -> Catalogue:
     return Catalogue.load(CATALOGUE_FILE)
 
 
-def standing(name: str, x: float, y: float, *, yaw: float = 0.0, height: float = tabletop.TABLE.height) -> Floats:
+def standing(name: str, x: float, y: float, *, yaw: float = 0.0, height: float = TABLE.height) -> Floats:
     """T_base_object of an upright object."""
     c, s = np.cos(yaw), np.sin(yaw)
     bottom = catalogue()[name].bounds[0, 2]
@@ -28,4 +30,4 @@ def standing(name: str, x: float, y: float, *, yaw: float = 0.0, height: float =
 
 def world(carried: str, **poses: Floats) -> CollisionWorld:
     objects = {name: (catalogue()[name], T) for name, T in poses.items()}
-    return CollisionWorld(fetch.robot_model(), tabletop.TABLE, objects, carried=carried)
+    return CollisionWorld(ROBOT, TABLE, objects, carried=carried)

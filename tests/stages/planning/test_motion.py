@@ -6,7 +6,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stages.devices import fetch
 from stages.planning.collision import CollisionWorld
 from stages.planning.motion import (
     POSITION_TOLERANCE,
@@ -19,9 +18,9 @@ from stages.planning.motion import (
     time_parameterise,
 )
 from stages.planning.pick_place import raised
-from tests.stages.planning.scenes import standing, world
+from tests.stages.planning.scenes import ROBOT, standing, world
 
-HOME = fetch.robot_model().home
+HOME = ROBOT.home
 
 
 @pytest.fixture(scope="module")
@@ -96,11 +95,10 @@ def test_free_motion_is_collision_free_and_repeatable(scene: CollisionWorld) -> 
 
 
 def test_trajectories_respect_the_limits() -> None:
-    robot = fetch.robot_model()
     waypoints = HOME + np.array([[0.0], [0.3], [-0.2], [0.4]]) * np.array([0.1, 1, 1, 1, 1, 1, 1, 1])
     waypoints[:, 0] = HOME[0] - np.abs(waypoints[:, 0] - HOME[0])
-    motion = time_parameterise(robot, waypoints, speed=0.5)
-    assert (np.abs(motion.velocities) <= 0.5 * robot.velocity * 1.02).all()
+    motion = time_parameterise(ROBOT, waypoints, speed=0.5)
+    assert (np.abs(motion.velocities) <= 0.5 * ROBOT.velocity * 1.02).all()
     np.testing.assert_allclose(motion.velocities[[0, -1]], 0, atol=1e-6)
     np.testing.assert_allclose(motion.positions[[0, -1]], waypoints[[0, -1]], atol=1e-6)
     assert (np.diff(motion.times) > 0).all()

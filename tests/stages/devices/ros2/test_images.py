@@ -3,11 +3,10 @@
 from collections.abc import Iterator
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
-from stages.devices.ros2.images import Lens, color, depth
+from stages.devices.ros2.images import color, depth, lens, pinhole
 from tests.stages.devices.ros2.bags import TYPES, compressed, image, info, png
 
 RNG = np.random.default_rng(0)
@@ -85,37 +84,19 @@ def test_an_image_that_is_too_short_is_refused() -> None:
         color(message)
 
 
-@pytest.mark.parametrize(
-    ("model", "d"),
-    [("plumb_bob", [-0.3, 0.1, 0.002, -0.001, 0.0]), ("rational_polynomial", [0.2, -0.1, 0, 0, 0, 0.1, 0, 0]),
-     ("equidistant", [-0.05, 0.01, 0.0, 0.0])],
-)  # fmt: skip
-def test_a_lens_is_taken_out(model: str, d: list[float]) -> None:
-    ray = np.array([[[0.35, -0.25, 1.0]]])
-    if model == "equidistant":
-        bent = cv2.fisheye.distortPoints(ray[:, :, :2], K, np.array(d))
-    else:
-        bent = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, np.array(d))[0]
-    column, row = np.round(bent.ravel()).astype(int)
-    rgb, metres = np.zeros((80, 100, 3), np.uint8), np.zeros((80, 100), np.float32)
-    rgb[row - 1 : row + 2, column - 1 : column + 2], metres[row - 1 : row + 2, column - 1 : column + 2] = 255, 0.7
-    lens = Lens(info(K, (80, 100), distortion_model=model, d=d), rectified=False)
-    straight, straight_metres = lens.straighten(rgb, metres)
-    expected = K @ ray.ravel()
-    for found in (straight[:, :, 0] > 128, straight_metres > 0.6):
-        rows, columns = np.nonzero(found)
-        assert (columns.mean(), rows.mean()) == pytest.approx(expected[:2], abs=1.0)
-    assert set(np.unique(straight_metres)) == {np.float32(0), np.float32(0.7)}  # never between two surfaces
-
-
-def test_lenses() -> None:
+def test_what_a_camera_info_says() -> None:
     projection = np.column_stack([2 * K, np.zeros(3)]).ravel()
-    assert Lens(info(K, (80, 100), d=[0.1] * 5, p=projection), rectified=True).K[0, 0] == 200
-    assert Lens(info(K, (80, 100), d=[0.0] * 5), rectified=False).K.tolist() == K.tolist()
+    assert pinhole(info(K, (80, 100), d=[0.1] * 5, p=projection), rectified=True)[0, 0] == 200
+    assert pinhole(info(K, (80, 100), d=[0.0] * 5), rectified=False).tolist() == K.tolist()
+    rgb, metres = np.zeros((80, 100, 3), np.uint8), np.ones((80, 100), np.float32)
+    for bent, rectified in ((False, False), (True, True)):
+        found = lens(info(K, (80, 100), d=[0.3 * bent] * 5), K, rectified=rectified)
+        assert found.straighten(rgb, metres)[1] is metres
+    assert not lens(info(K, (80, 100), d=[0.3] * 5), K, rectified=False).straighten(rgb, metres)[1].all()
     with pytest.raises(ValueError, match="distortion model 'thin' is not known; valid: plumb_bob"):
-        Lens(info(K, (80, 100), d=[0.1], distortion_model="thin"), rectified=False)
+        lens(info(K, (80, 100), d=[0.1], distortion_model="thin"), K, rectified=False)
     with pytest.raises(ValueError, match="the camera is not calibrated"):
-        Lens(TYPES.new("sensor_msgs/msg/CameraInfo"), rectified=False)
+        pinhole(TYPES.new("sensor_msgs/msg/CameraInfo"), rectified=False)
 
 
 def rvl(values: np.ndarray) -> bytes:

@@ -9,17 +9,9 @@ import pytest
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.perception.confidence.doubt import (
-    CONSTANTS,
-    Calibration,
-    Evidence,
-    Judge,
-    Judged,
-    Rival,
-    SceneDoubt,
-    cost_of_an_object,
-    hypothesis_probabilities,
-)
+from stages.perception.confidence.calibration import CONSTANTS, Calibration, cost_of_an_object, hypothesis_probabilities
+from stages.perception.confidence.doubt import Judge, SceneDoubt
+from stages.perception.confidence.evidence import Evidence, Judged, Rival
 from tests.stages.perception.scenes import CATALOGUE, Rendered, render, upright
 
 BOX = upright("tea_box", 0.0, 0.0, 0.6)

@@ -128,6 +128,15 @@ def test_bop_folder_with_a_missing_mesh_is_refused(tmp_path: Path) -> None:
         Catalogue.load(tmp_path)
 
 
+def test_a_link_that_git_wrote_as_a_file_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared" / "models_info.json").write_text('{"3": {}}')
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "models").write_text("../shared\n")
+    with pytest.raises(Refused, match=r"shared/obj_000003\.ply: no such mesh file"):
+        Catalogue.load(tmp_path / "set" / "models")
+
+
 def test_unreadable_mesh_is_refused_with_the_formats(folder: Path) -> None:
     (folder / "noise.ply").write_bytes(b"ply\nnot really")
     with pytest.raises(Refused, match=r"noise\.ply: not a readable mesh .*formats are .*stl"):

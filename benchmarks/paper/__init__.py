@@ -1,0 +1,1 @@
+"""The paper's experiments with the robot (section VI-B), redone in simulation."""

@@ -1,0 +1,117 @@
+"""Descriptions: what they say is true of the model, and nothing else in the source names a robot."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh.creation
+
+import stages.robots
+from runner.contract import Refused
+from stages.devices.check_robot import report
+from stages.robots import Robot, read_robot
+
+HERE = Path(__file__).parent
+FOLDER = Path(stages.robots.__file__).parent
+ALL = sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+@pytest.fixture(params=ALL)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return read_robot(FOLDER / f"{request.param}.yaml")
+
+
+def at_home(robot: Robot) -> tuple[tuple[str, ...], np.ndarray]:
+    return tuple(robot.posture), np.array(list(robot.posture.values()))
+
+
+def pixels(robot: Robot, points: np.ndarray) -> np.ndarray:
+    """Of points in the base frame, N x 2, from the middle of the image; nan behind the camera."""
+    seen = points @ robot.T_camera_base[:3, :3].T + robot.T_camera_base[:3, 3]
+    return np.where(seen[:, 2:] > 0.05, robot.camera.focal * seen[:, :2] / seen[:, 2:], np.nan)
+
+
+def test_the_camera_sees_where_the_robot_places(robot: Robot) -> None:
+    corners = [[x, 0.95 * y, robot.table.height] for x in robot.x for y in robot.y]
+    assert (np.abs(pixels(robot, np.array(corners))) < np.array(robot.camera.size) / 2).all()
+
+
+def test_the_arm_at_home_is_outside_the_cameras_image(robot: Robot) -> None:
+    for mesh, T in robot.links(*at_home(robot)):
+        inside = np.abs(pixels(robot, mesh.vertices @ T[:3, :3].T + T[:3, 3])) < np.array(robot.camera.size) / 2
+        assert not inside.all(1).any()
+
+
+def test_meshes_and_links_belong_together(robot: Robot) -> None:
+    links = robot.body.link_poses(*at_home(robot))
+    assert {link for link, _ in robot.body.meshes} <= set(links)
+    for _, mesh in robot.body.meshes:
+        assert mesh.colors.shape == mesh.vertices.shape
+        assert mesh.faces.max() < len(mesh.vertices)
+
+
+def test_widths_and_finger_positions_invert_each_other(robot: Robot) -> None:
+    for width in (0.01, 0.03, 0.06):
+        assert np.isclose(robot.gripper.width(robot.gripper.finger_position(width)), width)
+
+
+def test_the_torso_carries_the_camera() -> None:
+    robot = read_robot(FOLDER / "fetch.yaml")
+    names, positions = at_home(robot)
+    lowered = positions.copy()
+    lowered[names.index("torso_lift_joint")] -= 0.2
+    difference = robot.camera_pose(names, positions) - robot.camera_pose(names, lowered)
+    np.testing.assert_allclose(difference[:3, 3], [0, 0, 0.2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "elbow_flex_joint: {",
+            "elbow_joint: {",
+            r":\d+: joints\.elbow_joint: 'elbow_joint' is not in the model, which has",
+        ),
+        ("link: gripper_link", "link: grip", r":\d+: gripper\.link: 'grip' is not in the model"),
+        ("gymnasium_robotics/", "gymnasium_robot/", r"model\[0\]\.folder: .* 'gymnasium_robot' is not installed"),
+        ("velocity: 0.10,", "", r"joints\.torso_lift_joint: the key 'velocity' is missing"),
+        ("x: [0.45, 0.80]", "x: [0.8, 0.4]", r"workspace\.x: \[0\.8, 0\.4\] is not \[lowest, highest\]"),
+        ("fetch/robot.xml", "fetch/robots.xml", r"MuJoCo cannot read the model: .*robots\.xml"),
+        ("touching:", "touch:", r"touch: unknown key; valid are model, remove"),
+    ],
+)
+def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text((FOLDER / "fetch.yaml").read_text().replace(old, new, 1))
+    with pytest.raises(Refused, match=message):
+        read_robot(file)
+
+
+def test_a_description_is_tried_before_it_is_used() -> None:
+    tried = "\n".join(report(read_robot(HERE / "arm.yaml")))
+    assert "6 moved, 0 still, 2 of the gripper" in tried
+    assert "at home  free" in tried
+    assert "reach    42 of 42" in tried
+    assert "sees all of the workspace" in tried
+
+
+def test_meshes_of_a_urdf_are_found_in_its_packages(tmp_path: Path) -> None:
+    (tmp_path / "lab_arm" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((0.05, 0.16, 0.03)).export(tmp_path / "lab_arm" / "meshes" / "hand.stl")
+    for name in ("arm.yaml", "arm.urdf"):
+        mesh = '<mesh filename="package://lab_arm/meshes/hand.stl"/>'
+        (tmp_path / name).write_text((HERE / name).read_text().replace('<box size="0.05 0.16 0.03"/>', mesh))
+    (hand,) = [mesh for link, mesh in read_robot(tmp_path / "arm.yaml").body.meshes if link == "hand"]
+    np.testing.assert_allclose(np.ptp(hand.vertices, axis=0), (0.05, 0.16, 0.03), atol=1e-6)
+
+
+def test_no_source_names_a_robot() -> None:
+    names = re.compile(r"\b(fetch|ur5e|panda|robotiq)(?!ed)", re.IGNORECASE)
+    named = [
+        f"{path.relative_to(FOLDER.parent)}: {line.strip()}"
+        for path in sorted(FOLDER.parent.rglob("*.py"))
+        for line in path.read_text().splitlines()
+        if names.search(line)
+    ]
+    assert named == ['robots/robot.py: BUILT_IN = Path(__file__).parent / "fetch.yaml"']
