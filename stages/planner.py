@@ -117,7 +117,7 @@ class Planner(Stage):
         scene = Scene.of(task.current, self._stances)
         step = Step(task.aside, scene.supports[task.aside], TABLE)
         workspace = replace(self._config.workspace, targets=_ASIDE)
-        poses = Targets(Placements(task.current, self._stances), workspace).of((step,), scene, {})
+        poses = Targets(Placements(task.current, self._stances), workspace, self._robot).of((step,), scene, {})
         if isinstance(poses, Blocked | Crowded):
             return _answer("refused", "", reason=f"no room to put {task.aside} aside")
         item, T_table_base = scene.standing[task.aside], inverse(scene.T_base_table)
