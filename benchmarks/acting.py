@@ -31,8 +31,8 @@ from stages.messages import (
     Observation,
     Outcome,
     Plan,
+    Recover,
     RobotCommand,
-    RobotState,
     SceneEstimate,
     SceneGraph,
     Snapshot,
@@ -124,7 +124,10 @@ class Robot:
                 episode.plans.append(plan)
                 return self._demonstrator.on_plan(plan, ctx)
             case TransferRequest():
-                return self._demonstrator.on_outcome(self._carry_out(message), ctx)
+                outcome = self._carry_out(self._executor.on_transfer_request(message, ctx))
+                return self._demonstrator.on_outcome(outcome, ctx)
+            case Recover():
+                return self._demonstrator.on_outcome(self._carry_out(self._executor.on_recover(message, ctx)), ctx)
             case Goal():
                 episode.goal = message
             case Verdict():
@@ -134,7 +137,7 @@ class Robot:
         return None
 
     def _look(self, request: LookRequest) -> SceneGraph:
-        snapshot = self._world.on_look_request(request)
+        snapshot = self._world.on_look_request(request, self._ctx)
         self.episode.snapshots.append(snapshot)
         assert snapshot.T_base_table is not None and snapshot.table_size is not None
         T_base_camera = inverse(self._robot.T_camera_base)
@@ -169,10 +172,10 @@ class Robot:
         turn = Rotation.from_rotvec(rng.normal(0, np.deg2rad(1.0), 3)).as_matrix()
         return pose(turn @ T[:3, :3], T[:3, 3] + rng.normal(0, self._metres, 3))
 
-    def _carry_out(self, request: TransferRequest) -> Outcome:
-        answer = self._executor.on_transfer_request(request, self._ctx)
+    def _carry_out(self, answer: RobotCommand | Outcome | None) -> Outcome:
         while isinstance(answer, RobotCommand):
-            state: RobotState = self._world.on_robot_command(answer)
+            states = self._world.on_robot_command(answer, self._ctx)
+            state = next(each for each in states if each is not None)
             answer = self._executor.on_robot_state(state, self._ctx)
         assert isinstance(answer, Outcome)
         self.episode.outcomes.append(answer)

@@ -18,8 +18,9 @@ their annotations:
 
 Only stages marked ``device`` touch the outside (sensors, simulators, files, wall clock). A device may also
 define ``source(self, ctx) -> Iterator[Message]``, which is advanced between inputs; one that has handlers too yields
-None, after a moment, where there is nothing yet. Replay re-executes every other stage and substitutes what devices
-emitted.
+None, after a moment, where there is nothing yet. A handler of a device that takes long may yield None now and then:
+what has arrived for the other handlers has its turn before it goes on. Replay re-executes every other stage and
+substitutes what devices emitted.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from stages.messages import (
     Observation,
     Outcome,
     Plan,
+    Recover,
     Restore,
     RobotState,
     SceneGraph,
@@ -35,7 +36,9 @@ from stages.messages import (
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
+from stages.planning.hiding import hiders
 from stages.planning.pddl import goal_pddl
+from stages.planning.placements import Scene
 from stages.scene.catalogue import Catalogue
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import Stances, standing_of
@@ -49,6 +52,7 @@ class Phase(Enum):
     LOOKING = "a scene graph"
     PLANNING = "a plan"
     TRANSFERRING = "the outcome of a transfer"
+    RECOVERING = "the arm to come home"
     IDLE = "a command"
     DONE = "nothing more"
 
@@ -90,8 +94,14 @@ class State:
     """Key of every transfer that failed or missed its relation, in order."""
     complaint: str = ""
     """Why the newest transfer failed; empty where it reached its relation."""
+    missing: str = ""
+    """What is looked for by putting things aside, in words."""
+    searched: tuple[str, ...] = ()
+    """What was put aside, or could not be, since something was found."""
     stopping: bool = False
     """Somebody asked to stop: what is waited for is the last."""
+    halted: bool = False
+    """The arm stands where it was stopped."""
 
 
 class Demonstrator(Stage):
@@ -152,18 +162,18 @@ class Demonstrator(Stage):
             ctx.log(f'the person lays out the goal "{self._config.goal_name}"')
         return Arrangement(kind="goal")
 
-    def on_teach(self, teach: Teach, ctx: Context) -> LookRequest:
+    def on_teach(self, teach: Teach, ctx: Context) -> LookRequest | Recover:
         """Looks at what is to be remembered."""
         _refuse_odd_name(f"name={teach.name!r}", teach.name)
         self._begin(teach.name, None)
         ctx.log(f'looks at the goal "{teach.name}"')
-        return self._look(f"goal {teach.name}")
+        return self._first_look(f"goal {teach.name}")
 
-    def on_restore(self, restore: Restore, ctx: Context) -> LookRequest:
+    def on_restore(self, restore: Restore, ctx: Context) -> LookRequest | Recover:
         """Looks at what there is to do for a goal."""
         self._begin(restore.name, self._goal(restore.name))
         ctx.log(f'restores the goal "{restore.name}"')
-        return self._look(f"restore {restore.name}")
+        return self._first_look(f"restore {restore.name}")
 
     def on_forget(self, forget: Forget, ctx: Context) -> None:
         """Strikes a goal off; one that is being restored still is."""
@@ -172,11 +182,11 @@ class Demonstrator(Stage):
         self._state = replace(self._state, goals=goals)
         ctx.log(f'goal "{forget.name}" forgotten')
 
-    def on_look(self, look: Look, ctx: Context) -> LookRequest:
+    def on_look(self, look: Look, ctx: Context) -> LookRequest | Recover:
         """Looks without a goal."""
         self._begin("", None)
         ctx.log("looks at what is there")
-        return self._look("look")
+        return self._first_look("look")
 
     def on_stop(self, stop: Stop, ctx: Context) -> None:
         """Lets what is under way come to its end, and nothing follow it."""
@@ -214,7 +224,7 @@ class Demonstrator(Stage):
             self._state = replace(self._state, goal=whole, whole=None, lacking="")
         missing = self._missing(scene)
         if missing:
-            yield self._look_again("perception", missing, ctx)
+            yield self._look_for(missing, scene, ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
         else:
@@ -227,8 +237,13 @@ class Demonstrator(Stage):
         if self._state.stopping:
             return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
-        if plan.status == "solved":
-            return self._proceed(plan, ctx)
+        return self._proceed(plan, ctx) if plan.status == "solved" else self._without_plan(plan, ctx)
+
+    def _without_plan(self, plan: Plan, ctx: Context) -> LookRequest | Task | Verdict:
+        """Looks again, or behind something else."""
+        if self._state.missing and self._state.scene is not None:
+            ctx.log(plan.reason, level="warning")
+            return self._look_for(self._state.missing, self._state.scene, ctx)
         if plan.status == "satisfied":
             return self._look_again("planner", "the planner finds nothing to do, yet relations are violated", ctx)
         if self._state.failures:
@@ -236,11 +251,18 @@ class Demonstrator(Stage):
         return self._look_again("planner", plan.reason, ctx)
 
     def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
-        """Looks at what the transfer did, whether it claims success or not."""
+        """Looks at what the transfer did, whatever the hand has felt."""
+        stands = outcome.failed_stage == STOPPED or outcome.held
+        if stands and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
+            self._state = replace(self._state, halted=True)
+            stage = STOPPED if outcome.failed_stage == STOPPED else "executor"
+            return self._conclude(stage, outcome.reason, ctx)
+        if self._state.phase is Phase.RECOVERING:
+            return self._recovered(outcome, ctx)
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
             return None
         complaint = "" if outcome.success else f"{outcome.failed_stage}: {outcome.reason}"
-        how = "done" if outcome.success else f"failed at {complaint}"
+        how = "felt to stand, to be seen" if outcome.success else f"failed at {complaint}"
         ctx.log(
             f"transfer {outcome.number}, {outcome.object} to {outcome.destination}: {how}",
             level="info" if outcome.success else "warning",
@@ -249,6 +271,13 @@ class Demonstrator(Stage):
             return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
+
+    def _recovered(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict:
+        """The arm is at home again, or not."""
+        if outcome.success:
+            self._state = replace(self._state, halted=False)
+            return self._look(self._state.purpose)
+        return self._fail("executor", outcome.reason, ctx)
 
     def _goal(self, name: str) -> SceneGraph:
         goals = self._state.goals
@@ -260,7 +289,35 @@ class Demonstrator(Stage):
         """Starts from anew with a goal, or with one that is yet to be seen."""
         if self._state.phase is not Phase.IDLE:
             raise Refused(f"busy: waits for {self._state.phase.value}; ask again after the verdict")
-        self._state = State(goals=self._state.goals, goal_name=name, goal=goal)
+        self._state = State(goals=self._state.goals, goal_name=name, goal=goal, halted=self._state.halted)
+
+    def _first_look(self, purpose: str) -> LookRequest | Recover:
+        """Looks, once the arm is out of the way."""
+        if not self._state.halted:
+            return self._look(purpose)
+        self._state = replace(self._state, phase=Phase.RECOVERING, purpose=purpose)
+        return Recover()
+
+    def _look_for(self, missing: str, scene: SceneGraph, ctx: Context) -> LookRequest | Task | Verdict:
+        """One more look; after that, what may hide what is missing is put aside."""
+        state = self._state
+        if state.goal is None or state.repeats == 0 or state.transfers == self._config.max_transfers:
+            return self._look_again("perception", missing, ctx)
+        hidden = [name for name in self._hiders(scene, state.goal) if name not in state.searched]
+        if not hidden:
+            return self._look_again("perception", missing, ctx)
+        ctx.log(f"{missing}; looks behind and under {hidden[0]}")
+        self._state = replace(
+            state, phase=Phase.PLANNING, searched=(*state.searched, hidden[0]), transfer=None, missing=missing
+        )
+        return Task(goal_name=state.goal_name, goal=state.goal, current=scene, aside=hidden[0])
+
+    def _hiders(self, scene: SceneGraph, goal: SceneGraph) -> list[str]:
+        missing = [self._stances[item.label] for item in goal.objects if item.name not in _names(scene)]
+        movable = {item.name for item in scene.objects if self._catalogue[item.label].grasps}
+        perceived = standing_of(scene.objects, self._stances, scene.T_base_table)
+        heights = {item.name: item.z_bottom for item in perceived}
+        return hiders(missing, Scene.of(scene, self._stances), movable, heights)
 
     def _look(self, purpose: str) -> LookRequest:
         self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
@@ -319,7 +376,8 @@ class Demonstrator(Stage):
 
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
-        self._check_transfer(scene)
+        self._check_transfer(scene, ctx)
+        self._state = replace(self._state, missing="", searched=())
         held, violated = satisfied(goal, scene, self._catalogue)
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
@@ -334,16 +392,27 @@ class Demonstrator(Stage):
         self._state = replace(self._state, phase=Phase.PLANNING)
         return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided())
 
-    def _check_transfer(self, scene: SceneGraph) -> None:
-        """Compares the scene with what the newest transfer promised; one that failed stays in the plan."""
+    def _check_transfer(self, scene: SceneGraph, ctx: Context) -> None:
+        """Compares the scene with what the newest transfer promised; one that failed stays in the plan.
+
+        Done is what was felt to stand and is then seen there; what the hand did not feel the look decides.
+        """
         state = self._state
         if state.transfer is None:
             return
         transfer, complaint = state.transfer, state.complaint
+        seen = transfer.object not in state.remembered
+        if complaint.startswith("unknown") and seen and _reached(transfer, scene):
+            complaint = ""
         if not complaint and not _reached(transfer, scene):
             complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
+        if not complaint:
+            done = "done" if seen else "unknown: felt to stand, hidden from here"
+            ctx.log(f"transfer {state.transfers}, {transfer.object} to {transfer.destination}: {done}")
         if complaint:
-            state = replace(state, remainder=(transfer, *state.remainder), failures=(*state.failures, transfer.key))
+            # What slips from the hand is tried again: nothing is wrong with where it was to go.
+            failures = state.failures if complaint.startswith("slip") else (*state.failures, transfer.key)
+            state = replace(state, remainder=(transfer, *state.remainder), failures=failures)
         self._state = replace(state, transfer=None, complaint=complaint)
 
     def _avoided(self) -> tuple[str, ...]:
@@ -354,7 +423,7 @@ class Demonstrator(Stage):
         """Requests the first transfer of a solved plan, unless plans have been replaced too often."""
         state = self._state
         assert state.scene is not None  # A plan answers a task, and a task holds a scene.
-        change = "new" if state.plans == 1 else change_of_plan(state.remainder, plan.transfers)
+        change = "new" if state.plans == 1 or state.missing else change_of_plan(state.remainder, plan.transfers)
         steps = ", ".join(f"{transfer.object} to {transfer.destination}" for transfer in plan.transfers)
         ctx.log(f"plan {state.plans} ({change}): {steps}")
         replans = state.replans + (change == "replaced")
@@ -399,7 +468,7 @@ class Demonstrator(Stage):
 class AskedDemonstrator(Demonstrator):
     """Does what a device is asked from outside as well as what is called."""
 
-    def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Verdict:
+    def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Recover | Verdict:
         """Teaches or restores; what cannot be done is a verdict, for somebody waits for one."""
         try:
             if asked.kind == "teach":

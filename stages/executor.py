@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from runner.contract import Context, Refused, Stage
-from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
+from stages.messages import Brake, Halt, Outcome, Recover, RobotCommand, RobotState, TransferRequest
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
+
+if TYPE_CHECKING:
+    from stages.planning.transfer import Routine, TransferRoutine
 
 
 class Executor(Stage):
@@ -31,19 +37,23 @@ class Executor(Stage):
 
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
-        from stages.planning.transfer import Routine, TransferRoutine
+        from stages.planning.transfer import TransferRoutine
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
         self._robot = read_robot(config.robot)
         self._transfers = TransferRoutine
-        self._routine: Routine | None = None
+        self._transfer: TransferRoutine | None = None
+        """The newest one."""
+        self._steps: Routine | None = None
+        """What is under way."""
+        self._halted = False
         self._ctx: Context | None = None
 
     def on_transfer_request(self, transfer_request: TransferRequest, ctx: Context) -> RobotCommand | Outcome:
         """Starts a transfer: the first command reads the encoders."""
         self._ctx = ctx
-        routine = self._transfers(
+        self._transfer = self._transfers(
             transfer_request,
             robot=self._robot,
             table=self._robot.table,
@@ -52,22 +62,44 @@ class Executor(Stage):
             attempts=self._config.attempts,
             log=self._log,
         )
-        self._routine = routine.run()
-        return self._advance(None)
+        return self._begin(self._transfer.run())
+
+    def on_recover(self, recover: Recover, ctx: Context) -> RobotCommand | Outcome:
+        """Brings the arm home after a stop."""
+        self._ctx = ctx
+        assert self._transfer is not None  # Only what was asked for can have been stopped.
+        return self._begin(self._transfer.recover())
 
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> RobotCommand | Outcome | None:
         """Continues the transfer; states that answer no command of this stage are ignored."""
-        if self._routine is None:
+        if self._steps is None:
             return None
         self._ctx = ctx
-        return self._advance(robot_state)
+        # The stop may have come between two commands.
+        return self._advance(replace(robot_state, stopped="stop") if self._halted else robot_state)
+
+    def on_stop(self, stop: Halt, ctx: Context) -> Brake:
+        """Stops the arm, whatever it is doing."""
+        if self._steps is None:
+            raise Refused("the arm is not under way")
+        self._halted = True
+        return Brake()
+
+    def close(self) -> None:
+        """Says what is in the hand of an arm that was under way."""
+        if self._steps is not None and self._transfer is not None:
+            self._log(f"stopped on the way; {self._transfer.in_hand or 'nothing'} is in the hand")
+
+    def _begin(self, steps: Routine) -> RobotCommand | Outcome:
+        self._steps, self._halted = steps, False
+        return self._advance(None)
 
     def _advance(self, state: RobotState | None) -> RobotCommand | Outcome:
-        assert self._routine is not None
+        assert self._steps is not None
         try:
-            return next(self._routine) if state is None else self._routine.send(state)
+            return next(self._steps) if state is None else self._steps.send(state)
         except StopIteration as end:
-            self._routine = None
+            self._steps = None
             return end.value
 
     def _log(self, text: str) -> None:

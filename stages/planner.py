@@ -8,10 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import inverse
 from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning import search
+from stages.planning.hiding import uncovers
 from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
 from stages.planning.problem import TABLE, Problem, carriers, cycle
@@ -19,11 +23,13 @@ from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
-from stages.scene.stance import Stances
+from stages.scene.stance import Stances, Standing
 from stages.scene.virtual import satisfied
 
 SEARCHES = 16
 """Times that a plan is searched for, each knowing more of what is in the way."""
+_ASIDE = 100
+"""Places that are considered for what is put aside to see behind it."""
 
 
 class Impossible(Exception):
@@ -96,6 +102,8 @@ class Planner(Stage):
         for scene in (task.goal, task.current):
             if scene.frame != "base":
                 return _answer("refused", "", reason=_nowhere(scene))
+        if task.aside:
+            return self._put_aside(task, ctx)
         missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
         if missing:
             return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
@@ -109,6 +117,25 @@ class Planner(Stage):
             return self._solve_with_room(problem, task, ctx)
         except Impossible as reason:
             return _answer("refused", text, reason=str(reason))
+
+    def _put_aside(self, task: Task, ctx: Context) -> Plan:
+        """One transfer, to a place on the table where the object hides nothing of what it hides now."""
+        scene = Scene.of(task.current, self._stances)
+        step = Step(task.aside, scene.supports[task.aside], TABLE)
+        workspace = replace(self._config.workspace, targets=_ASIDE).of(self._robot)
+        handling = self._handling(self._robot, self._robot.table, ctx.rng)
+        poses = Targets(Placements(task.current, self._stances), workspace, handling, {}).of((step,), scene)
+        if isinstance(poses, Blocked | Crowded):
+            return _answer("refused", "", reason=f"no room to put {task.aside} aside")
+        item, T_table_base = scene.standing[task.aside], inverse(scene.T_base_table)
+        stances = self._stances[item.stance.item.name]
+        places = ((T, Standing.at(task.aside, stances, T_table_base @ T)) for T in poses[0])
+        free = [T for T, place in places if scene.eye is None or uncovers(item, place, scene.eye)]
+        if not free:
+            return _answer("refused", "", reason=f"wherever {task.aside} could be put, it would hide the same")
+        problem = self._problem(task, ())
+        chosen = np.stack(free[: self._config.workspace.targets])
+        return _answer("solved", "", transfers=[_transfer(step, chosen, problem)])
 
     def _problem(self, task: Task, held: Sequence[Assertion]) -> Problem:
         regions = {item.name for item in task.goal.virtual_objects}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from runner.contract import Context, Refused, Stage
 from stages.devices.miscalibration import Miscalibration
+from stages.devices.servo import PIECE
 from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.placing import moved
@@ -17,7 +20,7 @@ from stages.devices.suites.suite import Kind, Rejected
 from stages.devices.tabletop import Layout
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.messages import Arrange, Arrangement, LookRequest, Move, RobotCommand, RobotState, Snapshot
+from stages.messages import Arrange, Arrangement, Brake, LookRequest, Move, RobotCommand, RobotState, Snapshot
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -27,6 +30,8 @@ _DRIFT = 0.01
 _TILT = 0.995
 """Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
 _DRAWS = 200
+_LOOK = 4.0
+"""Seconds that pass for others while the robot looks and thinks."""
 
 
 class World(Stage):
@@ -58,7 +63,11 @@ class World(Stage):
         self._looks = 0
         rng = np.random.default_rng([config.seed, 4])
         self._wrong = Miscalibration.draw(rng, self._robot, joints=self._suite.joints)
-        self._simulation = Simulation(self._catalogue, self._robot, self._suite.names, self._suite.table)
+        self._simulation = Simulation(
+            self._catalogue, self._robot, self._suite.names, self._suite.table, factors=self._suite.factors
+        )
+        self._started = False
+        """Somebody may meddle: the start scene is laid out."""
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
@@ -73,7 +82,7 @@ class World(Stage):
 
     def on_move(self, move: Move, ctx: Context) -> None:
         """Puts one object elsewhere when somebody asks for it, whatever the robot is doing."""
-        layout = dict(zip(self._simulation.present, self._simulation.object_poses(), strict=True))
+        layout = self._simulation.layout()
         if move.name not in layout:
             raise Refused(f"name={move.name!r}: no such object; valid: {', '.join(layout)}")
         self._simulation.place(
@@ -81,8 +90,9 @@ class World(Stage):
         )
         ctx.log(f"{move.name} moved to {move.x:.2f}, {move.y:.2f}")
 
-    def on_look_request(self, look_request: LookRequest) -> Snapshot:
+    def on_look_request(self, look_request: LookRequest, ctx: Context) -> Snapshot:
         """The world as it is now, for the simulated camera."""
+        self._meddle(_LOOK, ctx)
         table = self._suite.table
         rng = np.random.default_rng([self._config.seed, 3, self._looks])
         self._looks += 1
@@ -98,20 +108,32 @@ class World(Stage):
             errors=self._wrong.at_a_look(rng),
         )
 
-    def on_robot_command(self, robot_command: RobotCommand) -> RobotState:
-        """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders."""
-        error = 0.0
-        if len(robot_command.times):
-            beyond = [self._wrong.joints[self._robot.joint_names.index(name)] for name in robot_command.joint_names]
-            error = self._simulation.follow(
-                robot_command.joint_names,
-                robot_command.times,
-                robot_command.positions + beyond,
-                robot_command.velocities,
-            )
-        if robot_command.gripper_width is not None:
-            self._simulation.move_gripper(robot_command.gripper_width)
-        return self._state(error)
+    def on_robot_command(self, robot_command: RobotCommand, ctx: Context) -> Iterator[RobotState | None]:
+        """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders.
+
+        What else arrives is heard in between, so that somebody may meddle or stop the arm.
+        """
+        servo = self._simulation.servo
+        joints = [self._robot.joint_names.index(name) for name in robot_command.joint_names]
+        if joints:
+            positions = robot_command.positions + self._wrong.joints[joints]
+            robot_command = structs.replace(robot_command, positions=positions)
+        try:
+            for _ in servo.carry_out(robot_command):
+                self._meddle(PIECE, ctx)
+                yield None
+        except GeneratorExit:
+            ctx.log(f"the arm stands; the fingers are {1e3 * servo.opening():.0f} mm apart")
+            raise
+        yield self._state()
+
+    def on_brake(self, brake: Brake) -> None:
+        """Stops the arm where it is."""
+        self._simulation.servo.brake()
+
+    def _meddle(self, seconds: float, ctx: Context) -> None:
+        if self._started and (what := self._suite.meddle(self._simulation, seconds)):
+            ctx.log(what)
 
     def _lay_out(self, kind: Kind, draw: tuple[int, ...], ctx: Context) -> None:
         """Draws scenes until one is possible and stands, and says how many were not, and why."""
@@ -124,6 +146,7 @@ class World(Stage):
                 rejected[str(reason)] += 1
                 continue
             self._simulation.arrange(layout)
+            self._started = kind == "start"
             if self._stands(layout):
                 because = ", ".join(f"{why} {count}" for why, count in rejected.items())
                 left_out = f"; {rejected.total()} of {draws} draws rejected: {because}" if because else ""
@@ -133,7 +156,7 @@ class World(Stage):
         raise RuntimeError(f"no {kind} scene of suite {self._config.suite} was possible in {_DRAWS} draws: {rejected}")
 
     def _stands(self, layout: Layout) -> bool:
-        poses = dict(zip(self._simulation.present, self._simulation.object_poses(), strict=True))
+        poses = self._simulation.layout()
         return all(
             np.linalg.norm(poses[name][:3, 3] - T[:3, 3]) < _DRIFT and poses[name][:3, 2] @ T[:3, 2] > _TILT
             for name, T in layout.items()
@@ -142,11 +165,15 @@ class World(Stage):
     def _encoders(self) -> Floats:
         return self._simulation.encoders() - self._wrong.joints
 
-    def _state(self, tracking_error: float = 0.0) -> RobotState:
+    def _state(self) -> RobotState:
+        servo = self._simulation.servo
         return RobotState(
             joint_names=self._robot.joint_names,
             positions=self._encoders(),
-            gripper_width=self._simulation.gripper_width(),
+            gripper_width=servo.opening(),
             time=self._simulation.time,
-            tracking_error=tracking_error,
+            tracking_error=servo.error,
+            stopped=servo.stopped,
+            reason=servo.reason,
+            force=servo.force,
         )

@@ -35,6 +35,8 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
         assert "  success: True" in restored.stdout.splitlines()
         again = runner("call", "demonstrator", "restore", "name=breakfast")
         assert "every relation of the goal holds" in again.stdout
+        idle = runner("call", "executor", "stop")
+        assert (idle.returncode, "the arm is not under way" in idle.stderr) == (2, True)
         assert runner("down").returncode == 0
         printed += process.communicate(timeout=60)[0]
     assert process.returncode == 0, printed

@@ -4,7 +4,7 @@ import contextlib
 import queue
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import cast
 
 import msgspec
@@ -150,11 +150,13 @@ class Inbox:
         """Whether a step could run now."""
         return bool(self._ready)
 
-    def pop(self) -> Ready | None:
-        """The next step in order of completion, or None."""
-        if not self._ready:
+    def pop(self, busy: Collection[str] = ()) -> Ready | None:
+        """The next step in order of completion, not of handlers that are ``busy``, or None."""
+        turn = next((k for k, ready in enumerate(self._ready) if ready.handler.name not in busy), None)
+        if turn is None:
             return None
-        ready = self._ready.popleft()
+        ready = self._ready[turn]
+        del self._ready[turn]
         for arrival in ready.arrivals:
             self._count(ready.handler, arrival.port, -1)
         return ready

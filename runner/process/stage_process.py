@@ -125,6 +125,8 @@ class StageProcess:
         self._recorded_steps = 0
         self._present: _Record | None = None
         """The step that runs."""
+        self._busy: list[str] = []
+        """Names of the handlers that run, the innermost last."""
         self._sent: dict[str, tuple[int, int]] = dict.fromkeys(self._node.type.outputs, (0, 0))
         self._heart = Heart(self._process, self._bus, self._vitals)
 
@@ -295,12 +297,17 @@ class StageProcess:
         """Runs one handler to its end and journals it."""
         time_ns = step_time(self._node, ready.arrivals, time.time_ns())
         emissions = self._executor.drafts(ready.handler, ready.arrivals, time_ns)
-        self._present = record = _Record(ready, time_ns)
+        outer, record = self._present, _Record(ready, time_ns)
+        self._present = record
+        self._busy.append(ready.handler.name)
         try:
-            for draft in record.timed(emissions):
-                self._emit(draft)
-                if self._stopping.is_set():
-                    raise Stopped
+            while not record.ended:
+                for draft in record.timed(emissions):
+                    self._emit(draft)
+                    if self._stopping.is_set():
+                        raise Stopped
+                if not record.ended:
+                    self._let_others_in()
         except Stopped:
             record.outcome = "stopped"
         except Refused as refusal:
@@ -309,8 +316,20 @@ class StageProcess:
             record.outcome, record.error = "failed", _summary(error)
             raise
         finally:
-            self._present = None
+            emissions.close()
+            self._busy.pop()
+            self._present = outer
             self._journal(record)
+
+    def _let_others_in(self) -> None:
+        """Runs the steps of other handlers, before one that has yielded None goes on."""
+        self._take_all(wait=False)
+        while not self._stopping.is_set():
+            ready = self._inbox.pop(self._busy)
+            if ready is None:
+                return
+            self._step(ready)
+        raise Stopped
 
     def _refuse_command(self, record: "_Record", handler: Handler, refusal: Refused) -> None:
         """What a person called and the stage refuses is done with; any other refusal ends the graph."""

@@ -1,7 +1,7 @@
 """Executes one step of one stage; the same code runs live and in a replay."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -86,10 +86,11 @@ class Executor:
     def run(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Envelope]:
         """Calls a handler as :meth:`drafts` does and yields what it emits in envelopes."""
         for draft in self.drafts(handler, arrivals, time_ns):
-            yield draft.envelope
+            if draft is not None:
+                yield draft.envelope
 
-    def drafts(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Draft]:
-        """Calls a handler and yields its messages as it emits them.
+    def drafts(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Generator[Draft | None]:
+        """Calls a handler and yields its messages as it emits them; None as a device does that lets others in.
 
         ``arrivals`` are in the order of the handler's parameters, the parts of a gather by index;
         ``time_ns`` is the step's logical time. Raises whatever the handler raises, CodecError for a message
@@ -103,7 +104,12 @@ class Executor:
         causes = tuple(arrival.envelope.id for arrival in arrivals)
         taken: set[str] = set()
         for message in _messages(getattr(self._stage, handler.name)(**arguments)):
-            yield self._draft(message, driver, causes, context.time_ns, taken)
+            if message is not None:
+                yield self._draft(message, driver, causes, context.time_ns, taken)
+            elif self._node.type.cls.device:
+                yield None
+            else:
+                raise BrokenContract("yielded None, which lets others have their turn; only a device may")
 
     def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft | None]:
         """Yields the messages of a device's source, each a step of its own at the clock's time; None as it does."""
@@ -175,7 +181,7 @@ def arguments_of(arrivals: Iterable[Arrival]) -> dict[str, Any]:
     return arguments
 
 
-def _messages(result: Message | Iterable[Message] | None) -> Iterator[Message]:
+def _messages(result: Message | Iterable[Message | None] | None) -> Iterator[Message | None]:
     """What a handler returned, as an iterator."""
     if isinstance(result, Message):
         yield result

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
+from stages.devices.servo import Servo
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.planning.collision import add_primitives, add_table, quaternion
@@ -16,15 +18,18 @@ from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of
 
 _TIMESTEP = 0.002
-_SETTLE_AFTER_MOTION = 0.25
-_GRIPPER_RAMP = 0.6
-"""Seconds over which a new gripper opening is commanded."""
-_GRIPPER_HOLD = 0.3
-"""Seconds for the fingers to stall or arrive."""
 _DROP = 0.002
 """Metres above their support at which objects are laid out."""
 _AWAY = (-3.0, 0.5)
 """Where on the floor behind the robot what no one has laid out is put, and how far apart; metres."""
+
+
+@dataclass(frozen=True)
+class Factors:
+    """How an object differs from what the catalogue says of it."""
+
+    mass: float = 1.0
+    friction: float = 1.0
 
 
 class Simulation:
@@ -34,7 +39,16 @@ class Simulation:
     coupled as on the real gripper keep what is held from creeping.
     """
 
-    def __init__(self, catalogue: Catalogue, robot: Robot, names: tuple[str, ...], table: Table) -> None:
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        robot: Robot,
+        names: tuple[str, ...],
+        table: Table,
+        *,
+        factors: Mapping[str, Factors] = MappingProxyType({}),
+    ) -> None:
+        """``factors``: of objects that are not as the catalogue has them."""
         self._robot, self._names, self.present = robot, names, names
         spec = robot.specification()
         option = spec.option
@@ -46,10 +60,13 @@ class Simulation:
         floor.pos = [0, 0, robot.floor]
         add_table(spec, table)
         for name in names:
-            _add_object(spec, name, catalogue[label_of(name, catalogue)])
+            _add_object(spec, name, catalogue[label_of(name, catalogue)], factors.get(name, Factors()))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._index()
+        self.servo = Servo(robot, self._model, self._data, self._step)
+        self._joints = np.array([self._model.joint(name).qposadr[0] for name in robot.joint_names])
+        self._pads = [self._model.geom(name).id for name in robot.model.pads]
+        self._rough = self._model.geom_friction[self._pads].copy()
 
     @property
     def time(self) -> float:
@@ -82,43 +99,55 @@ class Simulation:
         joint.qpos[:] = np.concatenate([T_base_object[:3, 3] + [0, 0, _DROP], quaternion(T_base_object[:3, :3])])
         joint.qvel[:] = 0
 
+    def add(self, name: str, T_base_object: Floats) -> None:
+        """Puts an object down that may have been out of the way."""
+        self.place(name, T_base_object, settle=0.0)
+        self.present = tuple(one for one in self._names if one == name or one in self.present)
+
+    def remove(self, name: str) -> None:
+        """Puts an object out of the way and out of sight."""
+        self._put(
+            name, pose(np.eye(3), np.array([_AWAY[0], _AWAY[1] * self._names.index(name), self._robot.floor + 0.1]))
+        )
+        self.present = tuple(one for one in self.present if one != name)
+
+    def touching(self, name: str) -> set[str]:
+        """Names of the bodies that an object touches: links of the robot, ``table``, other objects."""
+        mujoco.mj_forward(self._model, self._data)
+        bodies = self._model.geom_bodyid[self._data.contact.geom]
+        own = self._model.body(name).id
+        pairs = bodies[(bodies == own).any(axis=1)]
+        return {self._model.body(body).name for body in pairs.ravel() if body != own}
+
+    def held(self) -> str:
+        """The object that both fingers touch and nothing else does; empty where there is none."""
+        others = {"table", *self.present}
+        touched = {name: self.touching(name) for name in self.present}
+        return next((name for name, bodies in touched.items() if len(bodies) > 1 and not bodies & others), "")
+
+    def slide(self, factor: float) -> None:
+        """Makes the finger pads as rough as ``factor`` times what they are."""
+        self._model.geom_friction[self._pads] = factor * self._rough
+
     def run(self, seconds: float) -> None:
         """Lets time pass."""
         for _ in range(round(seconds / _TIMESTEP)):
-            mujoco.mj_step(self._model, self._data)
+            self._step()
 
-    def follow(self, joint_names: tuple[str, ...], times: Floats, positions: Floats, velocities: Floats) -> float:
-        """Follows a joint trajectory (T, T x J, T x J) with velocity feed-forward; returns the largest joint error."""
-        actuators = np.array([self._actuators[name] for name in joint_names])
-        addresses = np.array([self._model.joint(name).qposadr[0] for name in joint_names])
-        lag = -self._model.actuator_biasprm[actuators, 2] / self._model.actuator_gainprm[actuators, 0]
-        targets, rates = _resample(times, positions, velocities)
-        worst = 0.0
-        for target, command in zip(targets, targets + lag * rates, strict=True):
-            self._data.ctrl[actuators] = command
-            mujoco.mj_step(self._model, self._data)
-            worst = max(worst, float(np.abs(self._data.qpos[addresses] - target).max()))
-        self._data.ctrl[actuators] = targets[-1]
-        self.run(_SETTLE_AFTER_MOTION)
-        return worst
-
-    def move_gripper(self, width: float) -> None:
-        """Drives the fingers towards ``width`` metres apart; they stall with limited force at what is between them."""
-        start, end = self._data.ctrl[self._fingers].copy(), self._grip(width)
-        steps = round(_GRIPPER_RAMP / _TIMESTEP)
-        for k in range(1, steps + 1):
-            self._data.ctrl[self._fingers] = start + (end - start) * k / steps
-            mujoco.mj_step(self._model, self._data)
-        self.run(_GRIPPER_HOLD)
+    def _step(self) -> None:
+        mujoco.mj_step(self._model, self._data)
 
     def encoders(self) -> Floats:
         """Positions of the joints that :attr:`stages.robots.Robot.joint_names` names."""
         return self._data.qpos[self._joints].copy()
 
-    def gripper_width(self) -> float:
-        """Metres between the fingers."""
-        gripper = self._robot.gripper
-        return sum(gripper.width(float(self._data.joint(name).qpos[0])) for name in gripper.fingers) / 2
+    def layout(self) -> dict[str, Floats]:
+        """T_base_object (4 x 4) by name of every object that is ``present``."""
+        return dict(zip(self.present, self.object_poses(), strict=True))
+
+    def hand(self) -> Floats:
+        """x, y, z of the hand, metres."""
+        return self._data.body(self._robot.gripper.link).xpos.copy()
 
     def object_poses(self) -> Floats:
         """N x 4 x 4: T_base_object of every object that is ``present``, in that order."""
@@ -129,46 +158,21 @@ class Simulation:
         gripper = self._robot.gripper
         for name, position in self._robot.posture.items():
             self._data.joint(name).qpos[0] = position
-            self._data.ctrl[self._actuators[name]] = position
+            self._data.ctrl[self.servo.actuators[name]] = position
         for name, position in gripper.posture(gripper.open_width).items():
             self._data.joint(name).qpos[0] = position
-        self._data.ctrl[self._fingers] = self._grip(gripper.open_width)
-
-    def _grip(self, width: float) -> Floats:
-        """What is commanded to the actuators of the fingers; their own range need not be that of the joints."""
-        gain, bias = self._model.actuator_gainprm[self._fingers, 0], self._model.actuator_biasprm[self._fingers, 1]
-        return self._robot.gripper.finger_position(width) * (-bias / gain)
-
-    def _index(self) -> None:
-        model, joint = self._model, mujoco.mjtTrn.mjTRN_JOINT
-        self._joints = np.array([model.joint(name).qposadr[0] for name in self._robot.joint_names])
-        moved = {
-            k: model.joint(model.actuator_trnid[k, 0]).name
-            for k in range(model.nu)
-            if model.actuator_trntype[k] == joint
-        }
-        self._actuators = {name: k for k, name in moved.items()}
-        self._fingers = np.array([k for k in range(model.nu) if moved.get(k) not in self._robot.posture])
+        self._data.ctrl[self.servo.fingers] = self.servo.grip(gripper.open_width)
 
 
-def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject) -> None:
+def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject, factors: Factors) -> None:
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=name)
     geoms = add_primitives(body, entry.collision)
     volumes = [_volume(primitive.kind, primitive.size) for primitive in entry.collision]
     for geom, volume in zip(geoms, volumes, strict=True):
-        geom.mass = entry.mass * volume / sum(volumes)
-        geom.friction, geom.condim, geom.solref = [entry.friction, 0.01, 0.001], 4, [0.01, 1]
+        geom.mass = factors.mass * entry.mass * volume / sum(volumes)
+        geom.friction, geom.condim, geom.solref = [factors.friction * entry.friction, 0.01, 0.001], 4, [0.01, 1]
 
 
 def _volume(kind: str, size: tuple[float, ...]) -> float:
     return float(np.prod(size)) if kind == "box" else float(np.pi * size[0] ** 2 * size[1])
-
-
-def _resample(times: Floats, positions: Floats, velocities: Floats) -> tuple[Floats, Floats]:
-    """The trajectory at every time step of the simulation."""
-    if len(times) < 2:
-        return positions, velocities
-    spline = CubicHermiteSpline(times, positions, velocities)
-    steps = np.minimum(np.arange(1, round(times[-1] / _TIMESTEP) + 1) * _TIMESTEP, times[-1])
-    return spline(steps), spline(steps, 1)

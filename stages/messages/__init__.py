@@ -8,7 +8,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
-from stages.messages.robot import RobotCommand, RobotState
+from stages.messages.robot import Brake, RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
@@ -17,10 +17,12 @@ from stages.messages.task import (
     Arrangement,
     Forget,
     Goal,
+    Halt,
     Look,
     Move,
     Outcome,
     Plan,
+    Recover,
     Restore,
     Stop,
     Task,
@@ -36,12 +38,14 @@ __all__ = [
     "Asked",
     "Assertion",
     "Box",
+    "Brake",
     "Candidate",
     "Candidates",
     "Depth",
     "Forget",
     "Frame",
     "Goal",
+    "Halt",
     "Hypothesis",
     "Intrinsics",
     "Look",
@@ -56,6 +60,7 @@ __all__ = [
     "Pose",
     "Poses",
     "Posterior",
+    "Recover",
     "Restore",
     "Rgb",
     "RobotCommand",

@@ -1,7 +1,28 @@
 """What goes to the robot's controllers and what its encoders say."""
 
-from runner.contract import Message
+from typing import Literal
+
+from runner.contract import Message, Struct
 from stages.messages.arrays import Matrix, Vector
+
+Stopped = Literal["", "stop", "slip", "touch"]
+"""Why a command was not carried out to its end: somebody asked, the fingers moved, or something was in the way."""
+
+
+class Guard(Struct, frozen=True, kw_only=True):
+    """What must hold while a command is carried out; where it does not, the robot brakes at once.
+
+    Guarded motion (Will and Grossman 1975): the robot's own controllers compare what they measure in every cycle.
+    """
+
+    narrowest: float = 0.0
+    """Metres between the fingertips, at least."""
+    widest: float = 1.0
+    """Metres between the fingertips, at most."""
+    force: float = 1e6
+    """Newtons from outside, as if they acted on the hand: motor efforts beyond those that the motion takes."""
+    error: float = 0.05
+    """Radians (metres) by which a joint may be where it was not commanded to be."""
 
 
 class RobotCommand(Message, frozen=True, kw_only=True):
@@ -17,6 +38,12 @@ class RobotCommand(Message, frozen=True, kw_only=True):
     """Metres between the fingertips."""
     label: str = ""
     """What the motion is for, shown to people."""
+    guard: Guard | None = None
+    """Not watched where None."""
+
+
+class Brake(Message, frozen=True, kw_only=True):
+    """Has a command that is under way come to a stand at once."""
 
 
 class RobotState(Message, frozen=True, kw_only=True):
@@ -29,3 +56,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     """Robot clock, seconds."""
     tracking_error: float = 0.0
     """Largest joint error while the last trajectory ran, radians."""
+    stopped: Stopped = ""
+    reason: str = ""
+    """What was measured where it stopped."""
+    force: float = 0.0
+    """Largest force from outside that was felt while the last command ran, as if it acted on the hand, newtons."""

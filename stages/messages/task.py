@@ -6,10 +6,11 @@ from runner.contract import Command, Message, Struct
 from stages.messages.arrays import Pose, Poses
 from stages.messages.scene import Assertion, SceneGraph
 
-FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release"]
+FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release", "slip", "touch", "unknown", "stop"]
+"""``unknown``: let go of without having felt that it stands. ``slip``, ``touch``: why a motion was broken off."""
 
 STOPPED = "stop"
-"""Stands where a verdict names the stage that failed: somebody asked to stop."""
+"""Stands where an outcome or a verdict names the stage that failed: somebody asked to stop."""
 
 
 class Arrangement(Message, frozen=True, kw_only=True):
@@ -35,6 +36,8 @@ class Task(Message, frozen=True, kw_only=True):
     current: SceneGraph
     avoid: tuple[str, ...] = ()
     """Transfers that failed and should not be tried the same way again (``Transfer.key``)."""
+    aside: str = ""
+    """An object to be put elsewhere first, to see what it hides; nothing else is asked for then."""
 
 
 class Transfer(Struct, frozen=True, kw_only=True):
@@ -78,10 +81,15 @@ class TransferRequest(Message, frozen=True, kw_only=True):
     number: int
 
 
+class Recover(Message, frozen=True, kw_only=True):
+    """Asks the executor to bring the arm home from where it was stopped; what it holds goes back where it was."""
+
+
 class Outcome(Message, frozen=True, kw_only=True):
-    """How a transfer ended."""
+    """How a transfer ended, as far as the hand feels it: whether it is done the next look says."""
 
     number: int
+    """Of the transfer; 0 where the arm came home after a stop."""
     object: str
     destination: str
     success: bool
@@ -94,6 +102,8 @@ class Outcome(Message, frozen=True, kw_only=True):
     planning_seconds: float
     T_base_object: Pose | None = None
     """Where the hand let go of the object; None where it did not."""
+    held: str = ""
+    """What is still in the hand."""
 
 
 class Verdict(Message, frozen=True, kw_only=True):
@@ -145,6 +155,12 @@ class Stop(Command, frozen=True, kw_only=True):
     """Ends what is under way: the robot first puts down what it holds, and begins nothing more."""
 
     answers = (Verdict,)
+
+
+class Halt(Command, frozen=True, kw_only=True):
+    """Stops the arm at once, where it is. What it holds it goes on holding; the answer says what that is."""
+
+    answers = (Outcome,)
 
 
 class Arrange(Command, frozen=True, kw_only=True):

@@ -145,7 +145,7 @@ class PickPlacePlanner:
         """Objects too near the hand or what it holds; none where it is not reached or something else is too near."""
         world = self._world
         world.set_width(opening(world, hand.grasp, ROOM))
-        placing = [self._holding(hand), world.resting(self._errand.destination)]
+        placing = [self.holding(hand), world.resting(self._errand.destination)]
         before = raised(hand.T_base_hand, ABOVE) if self._is_picked else hand.T_base_prehand
         with ExitStack() as stack:
             for context in placing if self._is_picked else [world.touching(world.carried)]:
@@ -172,7 +172,7 @@ class PickPlacePlanner:
             if reach is None:
                 self._note("pick motion", "no free motion to the pre-grasp")
                 continue
-            with self._holding(pick.hand):
+            with self.holding(pick.hand):
                 carry = free_motion(self._world, pick.lift[-1], place.lower[0], self._rng)
             if carry is None:
                 self._note("place motion", "no free motion that carries it to the target")
@@ -198,7 +198,7 @@ class PickPlacePlanner:
             if approach is None:
                 self._note("pick motion", "no straight approach to a grasp")
                 continue
-            with self._holding(hand), world.resting(self._errand.source):
+            with self.holding(hand), world.resting(self._errand.source):
                 heights = (raised(hand.T_base_hand, height) for height in (LIFT, LIFT / 2))
                 lifts = (straight_motion(world, approach[-1], T) for T in heights)
                 lift = next((found for found in lifts if found is not None), None)
@@ -227,7 +227,7 @@ class PickPlacePlanner:
         if self.obstacle[0] != "place motion":
             self._note("place motion", "no reachable posture above the target")
         for q in self._postures(raised(hand.T_base_hand, ABOVE), seed, world.robot.home):
-            with self._holding(hand):
+            with self.holding(hand):
                 if not world.is_free(q):
                     continue
                 with world.resting(self._errand.destination):
@@ -247,7 +247,8 @@ class PickPlacePlanner:
         with self._world.touching(self._world.carried):
             return straight_motion(self._world, q, backwards)
 
-    def _holding(self, hand: HandPose) -> AbstractContextManager[None]:
+    def holding(self, hand: HandPose) -> AbstractContextManager[None]:
+        """While it lasts, the object is in the hand as at ``hand``."""
         return self._world.holding(inverse(hand.T_object_hand), hand.grasp.width)
 
     def _note(self, stage: FailedStage, reason: str) -> None:

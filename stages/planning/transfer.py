@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
+from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
 from stages.planning.motion import free_motion, straight_motion, time_parameterise
-from stages.planning.pick_place import HOVER, LIFT, RELEASE, ROOM, Errand, PickPlace, PickPlacePlanner, opening, raised
+from stages.planning.pick_place import (
+    HOVER,
+    LIFT,
+    RELEASE,
+    ROOM,
+    Errand,
+    PickPlace,
+    PickPlacePlanner,
+    Place,
+    opening,
+    raised,
+)
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 
@@ -29,8 +43,19 @@ _FAST, _SLOW = 0.7, 0.4
 _LOWERING_STEP = 0.002
 _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
+_EARLY = 0.025
+"""Metres above the target from which on a touch, while an object is lowered, is its support."""
 _CONTACT = 0.001
 """Metres that the hand must lag behind while it is lowered to count as contact."""
+_TOUCH, _BUMP = 4.0, 7.0
+"""Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
+_RUB = 15.0
+"""Newtons that do not matter where the hand leaves what it has let go of."""
+_EMPTY = 0.003
+"""Metres beyond closed up to which nothing is between the fingers."""
+_G = 9.81
+_WAYS_BACK = 3
+"""Times that the way back is tried."""
 _AWAY = 0.05
 """Radians from home beyond which the arm first goes home."""
 
@@ -46,10 +71,28 @@ class _Tally:
     """Where the hand let go of the object."""
 
 
+@dataclass(frozen=True)
+class _UnderWay:
+    """What is being carried out, for whoever has to find the way back from the middle of it."""
+
+    world: CollisionWorld
+    planner: PickPlacePlanner
+    plan: PickPlace
+
+
+class _BrokenOff(Exception):
+    """A command was not carried out to its end."""
+
+    def __init__(self, state: RobotState, label: str) -> None:
+        super().__init__(f"{state.reason} on the way to {label}")
+        self.state = state
+
+
 class TransferRoutine:
     """One transfer as a generator of commands; planned wholly before the hand closes on anything.
 
-    A grasp that closes on nothing leads to the next one. Whatever happens, the arm ends at home with an open hand.
+    A grasp that closes on nothing leads to the next one. A slip or a touch breaks the transfer off: what is held goes
+    back where it was taken from. Whatever happens, the arm ends at home with an open hand, unless somebody stops it.
     """
 
     def __init__(
@@ -64,9 +107,12 @@ class TransferRoutine:
         log: Callable[[str], None],
     ) -> None:
         self._request, self._robot, self._rng, self._attempts, self._log = request, robot, rng, attempts, log
-        self._table = replace(table, height=float(request.scene.T_base_table[2, 3]))
+        self._table = dataclasses.replace(table, height=float(request.scene.T_base_table[2, 3]))
         self._objects = {o.name: (catalogue[o.label], o.T_base_object) for o in request.scene.objects}
         self._tally = _Tally()
+        self._under_way: _UnderWay | None = None
+        self.in_hand = ""
+        """What the hand holds, as far as it has felt."""
 
     def run(self) -> Routine:
         """Commands to execute one after the other; each is answered by the encoders after it."""
@@ -74,13 +120,80 @@ class TransferRoutine:
         if transfer.object not in self._objects:
             return self._outcome("ik", f"{transfer.object} is not in the perceived scene")
         self._log(f"{transfer.object} -> {transfer.destination}: planning")
-        state = yield self._command("read the encoders")
-        self._tally.started = self._tally.clock = state.time
-        failure = yield from self._go_home_first(state)
-        if not failure[0]:
-            failure = yield from self._try_plans()
-        self._log(f"{transfer.object}: {f'{failure[0]} failed: {failure[1]}' if failure[0] else 'placed'}")
+        try:
+            state = yield from self._do("read the encoders")
+            self._tally.started = self._tally.clock
+            failure = yield from self._go_home_first(state)
+            if not failure[0]:
+                failure = yield from self._try_plans()
+        except _BrokenOff as broken:
+            failure = yield from self._come_back(broken)
+        ending = f"{failure[0]}: {failure[1]}" if failure[0] else "let go of, and felt to stand"
+        self._log(f"{transfer.object}: {ending}")
         return self._outcome(*failure)
+
+    def recover(self) -> Routine:
+        """Commands that bring the arm home from where it was stopped."""
+        try:
+            state = yield from self._do("read the encoders")
+            self._tally.started = self._tally.clock
+            failure = yield from self._way_back(state)
+        except _BrokenOff as broken:
+            failure = self._stands(broken)
+        return replace(self._outcome(*failure), number=0)
+
+    def _come_back(self, broken: _BrokenOff) -> Steps:
+        """After a slip or a touch; where somebody asks to stop, and where the way back is barred, the arm stays."""
+        newest = broken
+        for _ in range(_WAYS_BACK):
+            if newest.state.stopped == "stop":
+                break
+            self._log(f"broken off: {newest}")
+            try:
+                failure = yield from self._way_back(newest.state)
+            except _BrokenOff as again:
+                newest = again
+                continue
+            return failure if failure[0] else (broken.state.stopped, str(broken))
+        return self._stands(newest)
+
+    def _stands(self, broken: _BrokenOff) -> tuple[FailedStage, str]:
+        """The arm stays where it is."""
+        asked = broken.state.stopped == "stop"
+        why = "as asked" if asked else f"the way back is barred: {broken}"
+        return ("stop" if asked else "touch"), f"stopped, {why}; in the hand: {self.in_hand or 'nothing'}"
+
+    def _way_back(self, state: RobotState) -> Steps:
+        """From wherever the arm stands: what is held goes back to where it was taken from, the hand goes home."""
+        at, q = self._under_way, self._arm(state)
+        if at is None:
+            return (yield from self._home(self._world(_CLEARANCES[-1]), q))
+        if self.in_hand:
+            state = yield from self._do("feel what is in the hand", width=0.0)
+            if state.gripper_width > self._robot.gripper.closed_width + _EMPTY:
+                return (yield from self._put_back(at, q))
+        yield from self._do("open the hand", width=self._robot.gripper.open_width)
+        self.in_hand = ""
+        nearest = np.abs(at.plan.pick.approach - q).max(1)
+        if nearest.min() < _AWAY:
+            back = np.vstack([q, at.plan.pick.approach[: nearest.argmin()][::-1]])
+            yield from self._do("back off", back, speed=_SLOW)
+            q = back[-1]
+        return (yield from self._home(at.world, q))
+
+    def _put_back(self, at: _UnderWay, q: Floats) -> Steps:
+        """What is held returns to where it was taken from, which is free and within reach."""
+        pick = at.plan.pick
+        rise = straight_motion(at.world, q, raised(at.world.hand(q), LIFT), free=False)
+        rise = q[None] if rise is None else rise
+        with at.planner.holding(pick.hand):
+            carry = free_motion(at.world, rise[-1], pick.lift[-1], self._rng)
+        if carry is None:
+            return "release", f"no free way back; in the hand: {at.world.carried}"
+        yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
+        yield from self._do(f"carry {at.world.carried} back", carry)
+        # Straight down the way it came, but for the last waypoint: from there on it is felt for.
+        return (yield from self._put_down(at, Place(pick.hand, pick.lift[:0:-1]), guard=None))
 
     def _go_home_first(self, state: RobotState) -> Steps:
         q = self._arm(state)
@@ -94,80 +207,93 @@ class TransferRoutine:
             world = self._world(clearance)
             planner = PickPlacePlanner(world, self._errand(), self._rng)
             for plan in self._timed(planner.plans(self._robot.home)):
-                failure = yield from self._execute(world, planner, plan)
+                self._under_way = _UnderWay(world, planner, plan)
+                failure = yield from self._execute(self._under_way)
                 if failure[0] != "grasp" or self._tally.attempts >= self._attempts:
                     return failure
             if self._tally.attempts == 0:
                 failure = planner.obstacle
         return failure
 
-    def _execute(self, world: CollisionWorld, planner: PickPlacePlanner, plan: PickPlace) -> Steps:
+    def _execute(self, at: _UnderWay) -> Steps:
+        world, plan, grasp = at.world, at.plan, at.plan.pick.hand.grasp
         self._tally.attempts += 1
-        self._tally.grasp = plan.pick.hand.grasp.name
-        grasp = plan.pick.hand.grasp
-        yield self._command("open the hand", width=opening(world, grasp, ROOM))
-        yield self._command(f"reach for {world.carried}", plan.reach)
-        state = yield self._command(f"close on {world.carried}", plan.pick.approach, speed=_SLOW, width=0.0)
+        self._tally.grasp = grasp.name
+        yield from self._do("open the hand", width=opening(world, grasp, ROOM))
+        yield from self._do(f"reach for {world.carried}", plan.reach, guard=Guard(force=_BUMP))
+        close = f"close on {world.carried}"
+        state = yield from self._do(close, plan.pick.approach, speed=_SLOW, width=0.0, guard=Guard(force=_TOUCH))
         if not self._is_held(state, grasp):
             return (yield from self._back_off(world, plan, state))
+        self.in_hand = world.carried
         self._log(f"{world.carried}: grasped with {grasp.name!r}, {1e3 * state.gripper_width:.0f} mm wide")
-        state = yield self._command(f"lift {world.carried}", plan.pick.lift, speed=_SLOW)
-        if self._is_held(state, grasp):
-            state = yield self._command(f"carry {world.carried}", plan.carry)
-        if not self._is_held(state, grasp):
-            return (yield from self._give_up(world, state))
-        return (yield from self._put_down(world, planner, plan))
+        narrowest, widest = self._held_between(grasp)
+        lifting = Guard(narrowest=narrowest, widest=widest)
+        yield from self._do(f"lift {world.carried}", plan.pick.lift, speed=_SLOW, guard=lifting)
+        weight = _G * self._objects[world.carried][0].mass
+        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + weight))
+        return (yield from self._put_down(at, plan.place, guard=replace(lifting, force=_TOUCH + weight)))
 
     def _back_off(self, world: CollisionWorld, plan: PickPlace, state: RobotState) -> Steps:
         """Out of a grasp that closed on nothing."""
         expected = plan.pick.hand.grasp.width
         reason = f"the fingers closed to {1e3 * state.gripper_width:.0f} mm instead of {1e3 * expected:.0f}"
         self._log(f"{world.carried}: not grasped with {self._tally.grasp!r}: {reason}")
-        yield self._command("open the hand", width=self._robot.gripper.open_width)
-        yield self._command("back off", plan.pick.approach[::-1], speed=_SLOW)
+        yield from self._do("open the hand", width=self._robot.gripper.open_width)
+        yield from self._do("back off", plan.pick.approach[::-1], speed=_SLOW)
         failure = yield from self._home(world, plan.pick.approach[0])
         return failure if failure[0] else ("grasp", reason)
 
-    def _give_up(self, world: CollisionWorld, state: RobotState) -> Steps:
-        """Home after the object slipped out of the hand; what lies where is unknown until the next look."""
-        yield self._command("open the hand", width=self._robot.gripper.open_width)
-        failure = yield from self._home(world, self._arm(state))
-        return failure if failure[0] else ("grasp", "it slipped out of the hand while it was lifted or carried")
-
-    def _put_down(self, world: CollisionWorld, planner: PickPlacePlanner, plan: PickPlace) -> Steps:
-        hand = plan.place.hand
-        state = yield self._command(f"lower {world.carried}", plan.place.lower, speed=_SLOW)
-        q = yield from self._lower_until_contact(world, state, plan.place.lower[-1], hand.T_base_hand)
+    def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard | None) -> Steps:
+        world = at.world
+        try:
+            state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
+            q, felt = yield from self._lower_until_contact(world, state, place)
+        except _BrokenOff as broken:
+            # What is held by its rim hangs lower than it was lifted.
+            state, q, felt = broken.state, self._arm(broken.state), True
+            height = world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3]
+            if state.stopped != "touch" or height > _EARLY:
+                raise
         held = state.gripper_width
         wanted = min(held + 2 * RELEASE, self._robot.gripper.open_width)
-        state = yield self._command(f"let go of {world.carried}", width=wanted)
-        left = world.hand(q) @ inverse(plan.pick.hand.T_object_hand)
+        state = yield from self._do(f"let go of {world.carried}", width=wanted)
+        self.in_hand = ""
+        left = world.hand(q) @ inverse(at.plan.pick.hand.T_object_hand)
         world.move(left)
-        retreat = planner.retreat(hand, q)
-        retreat = plan.place.lower[::-1] if retreat is None else retreat
-        yield self._command("retreat", retreat, speed=_SLOW)
-        yield self._command("open the hand", width=self._robot.gripper.open_width)
+        self._tally.T_base_object = left
+        retreat = at.planner.retreat(place.hand, q)
+        retreat = place.lower[::-1] if retreat is None else retreat
+        yield from self._do("retreat", retreat, speed=_SLOW, guard=Guard(force=_RUB))
+        yield from self._do("open the hand", width=self._robot.gripper.open_width)
         world.set_width(self._robot.gripper.open_width)
         failure = yield from self._home(world, retreat[-1])
         if state.gripper_width < (held + wanted) / 2:
+            self._tally.T_base_object = None
             return "release", f"the hand opened to {1e3 * state.gripper_width:.0f} mm of {1e3 * wanted:.0f}"
-        self._tally.T_base_object = left
+        if not (felt or failure[0]):
+            return "unknown", f"nothing was felt below {world.carried} where it was let go of"
         return failure
 
     def _lower_until_contact(
-        self, world: CollisionWorld, state: RobotState, q: Floats, T_base_hand: Floats
-    ) -> Generator[RobotCommand, RobotState, Floats]:
-        """Lowers step by step until the support holds the hand back; returns the last commanded posture (J)."""
+        self, world: CollisionWorld, state: RobotState, place: Place
+    ) -> Generator[RobotCommand, RobotState, tuple[Floats, bool]]:
+        """Lowers step by step until the support holds the hand back.
+
+        Returns the last commanded posture (J), and whether a support was felt.
+        """
+        q = place.lower[-1]
         sag = self._lag(world, q, state)
+        narrowest, _ = self._held_between(place.hand.grasp)
         for height in np.arange(HOVER - _LOWERING_STEP, _LOWEST, -_LOWERING_STEP):
-            step = straight_motion(world, q, raised(T_base_hand, height), free=False)
+            step = straight_motion(world, q, raised(place.hand.T_base_hand, height), free=False)
             if step is None:
                 break
-            state = yield self._command("feel for the support", step, speed=_SLOW)
+            state = yield from self._do("feel for the support", step, speed=_SLOW, guard=Guard(narrowest=narrowest))
             q = step[-1]
             if self._lag(world, q, state) - sag > _CONTACT:
-                break
-        return q
+                return q, True
+        return q, False
 
     def _home(self, world: CollisionWorld, q: Floats) -> Steps:
         """Collision-free motion home; where something is too close, after a step straight up."""
@@ -178,7 +304,8 @@ class TransferRoutine:
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
-        yield self._command("go home", path)
+        yield from self._do("go home", path, guard=Guard(force=_BUMP))
+        self._under_way = None
         return "", ""
 
     def _home_from_above(self, world: CollisionWorld, q: Floats) -> Floats | None:
@@ -207,21 +334,44 @@ class TransferRoutine:
 
     def _is_held(self, state: RobotState, grasp: Grasp) -> bool:
         """The fingers stalled near the width at which they touch the object."""
-        self._tally.clock = state.time
+        narrowest, widest = self._held_between(grasp)
+        return narrowest < state.gripper_width < widest
+
+    def _held_between(self, grasp: Grasp) -> tuple[float, float]:
+        """Metres between the fingers while they hold the object, at least and at most."""
         shut = self._robot.gripper.closed_width
-        return shut + 0.5 * (grasp.width - shut) < state.gripper_width < grasp.width + ROOM
+        return shut + 0.5 * (grasp.width - shut), grasp.width + ROOM
 
     def _lag(self, world: CollisionWorld, q: Floats, state: RobotState) -> float:
         """Metres that the hand is higher than commanded."""
         return float(world.hand(self._arm(state))[2, 3] - world.hand(q)[2, 3])
 
     def _arm(self, state: RobotState) -> Floats:
-        self._tally.clock = state.time
         where = {name: index for index, name in enumerate(state.joint_names)}
         return state.positions[[where[name] for name in self._robot.joints]]
 
+    def _do(
+        self,
+        label: str,
+        waypoints: Floats | None = None,
+        *,
+        speed: float = _FAST,
+        width: float | None = None,
+        guard: Guard | None = None,
+    ) -> Generator[RobotCommand, RobotState, RobotState]:
+        """Has one command carried out.
+
+        Raises:
+            _BrokenOff: it was stopped on the way.
+        """
+        state = yield self._command(label, waypoints, speed=speed, width=width, guard=guard)
+        self._tally.clock = state.time
+        if state.stopped:
+            raise _BrokenOff(state, label)
+        return state
+
     def _command(
-        self, label: str, waypoints: Floats | None = None, *, speed: float = _FAST, width: float | None = None
+        self, label: str, waypoints: Floats | None, *, speed: float, width: float | None, guard: Guard | None
     ) -> RobotCommand:
         """A trajectory through ``waypoints`` (W x J), then a gripper width; either may be absent."""
         if waypoints is None:
@@ -235,6 +385,7 @@ class TransferRoutine:
             velocities=motion.velocities,
             gripper_width=width,
             label=label,
+            guard=guard,
         )
 
     def _outcome(self, failed_stage: FailedStage, reason: str) -> Outcome:
@@ -251,4 +402,5 @@ class TransferRoutine:
             robot_seconds=tally.clock - tally.started,
             planning_seconds=tally.planning_seconds,
             T_base_object=tally.T_base_object,
+            held=self.in_hand,
         )

@@ -143,15 +143,16 @@ class Truth:
     ) -> tuple[Loss, ...]:
         """What left the table, stands neither as it was shown nor as at the start, or had to stay and did not."""
         shown, start, final = map(_poses, (snapshots[0], snapshots[min(1, len(snapshots) - 1)], snapshots[-1]))
+        came = {name: T for one in reversed(snapshots[1:]) for name, T in _poses(one).items()}
         T_base_table = _table(snapshots[-1], taught)
         found: list[Loss] = []
         for name, T in final.items():
-            before = [poses[name] for poses in (shown, start) if name in poses]
+            before = [poses[name] for poses in (shown, start, came) if name in poses]
             if _left(T, T_base_table):
                 found.append(Loss(name, "left the table", name in words))
             elif not any(self._alike(name, T, other) for other in before):
                 found.append(Loss(name, "was knocked over", name in words))
-            elif name not in shown and np.linalg.norm(T[:2, 3] - start[name][:2, 3]) > _STAYED:
+            elif name not in shown and np.linalg.norm(T[:2, 3] - came[name][:2, 3]) > _STAYED:
                 found.append(Loss(name, "is in no goal and was moved", name in words | carried))
         return tuple(found)
 

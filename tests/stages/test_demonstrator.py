@@ -8,6 +8,7 @@ import pytest
 
 from runner.contract import Message, Refused
 from stages.demonstrator import Demonstrator, change_of_plan
+from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
@@ -17,6 +18,7 @@ from stages.messages import (
     Look,
     LookRequest,
     Observation,
+    Recover,
     Restore,
     RobotState,
     SceneGraph,
@@ -91,12 +93,16 @@ class Episode:
         handler = getattr(self.stage, f"on_{type(command).__name__.lower()}")
         return self.take(handler(command, self.ctx))
 
-    def until_task(self, goal: SceneGraph = GOAL, start: SceneGraph = START) -> Task:
-        """Everything up to the first request for a plan."""
+    def until_start(self, goal: SceneGraph) -> None:
+        """Everything up to the look at the start scene."""
         self.take(self.stage.on_start(self.ctx))
         self.arranged()
         self.seen(goal)
         self.arranged()
+
+    def until_task(self, goal: SceneGraph = GOAL, start: SceneGraph = START) -> Task:
+        """Everything up to the first request for a plan."""
+        self.until_start(goal)
         (task,) = self.seen(start)
         assert isinstance(task, Task)
         return task
@@ -455,3 +461,55 @@ def test_says_how_a_plan_changed(before: str, after: str, change: str) -> None:
 def test_refuses_bad_settings(bad: dict[str, object]) -> None:
     with pytest.raises(Refused, match=rf"demonstrator\.{next(iter(bad))}="):
         Demonstrator.Config(catalogue=CATALOGUE, **bad)  # type: ignore[arg-type]
+
+
+def test_after_the_arm_was_stopped_it_comes_home_before_the_next_look() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    episode.called(Restore(name="tea"))
+    episode.seen(START)
+    episode.planned(STEP)
+    verdict = the_verdict(episode.ended(1, STEP, failed_stage=STOPPED, reason="stopped, as asked; in the hand: cup"))
+    assert (verdict.success, verdict.failed_stage) == (False, STOPPED)
+    assert verdict.reason == "stopped, as asked; in the hand: cup"
+    assert episode.called(Restore(name="tea")) == [Recover()]
+    assert episode.ended(0, STEP) == [LookRequest(purpose="restore tea")]
+    episode.seen(GOAL)
+    assert episode.called(Look()) == [LookRequest(purpose="look")]
+
+
+def test_what_the_hand_did_not_feel_the_look_decides() -> None:
+    episode = Episode()
+    episode.until_task()
+    episode.planned(STEP)
+    episode.ended(1, STEP, failed_stage="unknown", reason="nothing was felt below cup where it was let go of")
+    assert the_verdict(episode.seen(GOAL)).success
+
+
+def test_what_may_hide_a_missing_object_is_put_aside_before_it_is_given_up() -> None:
+    goal, start = with_shaker(OPEN), Layout(dict(CARTON.poses))
+    episode = Episode()
+    episode.until_start(goal.graph())
+    seen = msgspec.structs.replace(start.graph(), support=regions.rectangle([-0.3, -0.4], [0.3, 0.4]))
+    assert episode.seen(seen, view(start)) == [LookRequest(purpose="start, look 2")]
+    (task,) = episode.seen(seen, view(start))
+    assert isinstance(task, Task) and task.aside == "milk_carton"
+    aside = transfer("milk_carton", "table", "table")
+    (request,) = episode.planned(aside)
+    assert isinstance(request, TransferRequest) and request.transfer == aside
+    assert episode.ended(1, aside) == [LookRequest(purpose="after transfer 1")]
+    assert episode.seen(seen, view(start)) == [LookRequest(purpose="after transfer 1, look 2")]
+    assert episode.seen(seen, view(start)) == [LookRequest(purpose="after transfer 1, look 3")]
+    verdict = the_verdict(episode.seen(seen, view(start)))
+    assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
+
+
+def test_what_slipped_is_tried_again_as_it_was() -> None:
+    episode = Episode()
+    task = episode.until_task()
+    for number in (1, 2, 3):
+        episode.planned(STEP)
+        episode.ended(number, STEP, failed_stage="slip", reason="the fingers are 2 mm apart on the way to lift cup")
+        (task,) = episode.seen(START)
+        assert isinstance(task, Task) and task.avoid == ()

@@ -1,5 +1,6 @@
 """The executor and the simulated world, played against each other."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -7,12 +8,25 @@ import numpy as np
 import pytest
 
 from runner.contract import Level, Refused
+from stages.devices.simulation import Simulation
 from stages.devices.suites import tray
 from stages.executor import Executor
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
-from stages.messages import Arrangement, LookRequest, Outcome, RobotCommand, SceneGraph, Transfer, TransferRequest
+from stages.messages import (
+    Arrangement,
+    Halt,
+    LookRequest,
+    Outcome,
+    Recover,
+    RobotCommand,
+    RobotState,
+    SceneGraph,
+    Transfer,
+    TransferRequest,
+)
 from stages.messages.scene import SceneObject
+from stages.messages.task import STOPPED
 from stages.robots import BUILT_IN, read_robot
 from stages.world import World
 from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, standing
@@ -37,9 +51,16 @@ class Bench:
         self.world = World(World.Config(catalogue=CATALOGUE_FILE, robot=robot, seed=seed, goal=goal))
         self.executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE, robot=robot, attempts=2))
         self.world.on_arrangement(Arrangement(kind="start"), self.ctx)
+        self.meddle: Callable[[str], None] = lambda label: None
+        """Called while a command is carried out, with what it is for."""
+        self.states: list[RobotState] = []
+
+    @property
+    def simulation(self) -> Simulation:
+        return self.world._simulation  # pyright: ignore[reportPrivateUsage]
 
     def poses(self) -> dict[str, Floats]:
-        snapshot = self.world.on_look_request(LookRequest(purpose="test"))
+        snapshot = self.world.on_look_request(LookRequest(purpose="test"), self.ctx)
         return dict(zip(snapshot.names, snapshot.T_base_objects, strict=True))
 
     def transfer(self, poses: dict[str, Floats], name: str, destination: str, target: Floats) -> Outcome:
@@ -47,21 +68,32 @@ class Bench:
             object=name, source="table", destination=destination, T_base_targets=target[None], pick="", place=""
         )
         request = TransferRequest(transfer=transfer, scene=graph(poses, self.robot.table.height), number=1)
-        answer = self.executor.on_transfer_request(request, self.ctx)
+        return self.played(self.executor.on_transfer_request(request, self.ctx))
+
+    def played(self, answer: RobotCommand | Outcome) -> Outcome:
         while isinstance(answer, RobotCommand):
-            following = self.executor.on_robot_state(self.world.on_robot_command(answer), self.ctx)
+            following = self.executor.on_robot_state(self.does(answer), self.ctx)
             assert following is not None
             answer = following
         return answer
 
+    def does(self, command: RobotCommand) -> RobotState:
+        for state in self.world.on_robot_command(command, self.ctx):
+            if state is not None:
+                self.states.append(state)
+                return state
+            self.meddle(command.label)
+        raise AssertionError("no answer")
+
     def is_home(self) -> bool:
-        state = self.world.on_robot_command(RobotCommand(times=np.zeros(0), positions=NONE, velocities=NONE))
+        state = self.does(READ)
         where = dict(zip(state.joint_names, state.positions, strict=True))
         is_open = state.gripper_width > 0.9 * self.robot.gripper.open_width
         return is_open and all(abs(where[n] - p) < 0.02 for n, p in self.robot.posture.items())
 
 
 NONE = np.zeros((0, 8))
+READ = RobotCommand(times=np.zeros(0), positions=NONE, velocities=NONE)
 OTHERS = [
     BUILT_IN.with_name("ur5e.yaml"),
     BUILT_IN.with_name("panda.yaml"),
@@ -161,6 +193,81 @@ def test_an_object_that_was_not_perceived_is_reported() -> None:
     outcome = bench.transfer(poses, "cup", "table", target)
     assert outcome.failed_stage == "ik"
     assert "cup" in outcome.reason
+
+
+def test_a_stop_reaches_the_arm_on_its_way_and_what_it_held_goes_back() -> None:
+    bench = Bench(0, "tea")
+    before, asked = bench.poses(), list[float]()
+
+    def stop(label: str) -> None:
+        if label == "carry soup_can" and not asked and bench.simulation.time > bench.states[-1].time + 0.5:
+            asked.append(bench.simulation.time)
+            bench.world.on_brake(bench.executor.on_stop(Halt(), bench.ctx))
+
+    bench.meddle = stop
+    outcome = bench.transfer(before, "soup_can", "table", standing("soup_can", 0.55, 0.45))
+    assert (outcome.success, outcome.failed_stage, outcome.held) == (False, STOPPED, "soup_can")
+    assert outcome.reason == "stopped, as asked; in the hand: soup_can"
+    stood = bench.states[-1]
+    assert stood.stopped == "stop" and stood.time - asked[0] < 0.2
+    bench.simulation.run(2.0)
+    (still,) = (s for s in bench.world.on_robot_command(READ, bench.ctx) if s is not None)
+    assert np.abs(still.positions - stood.positions).max() < 0.01
+    assert bench.poses()["soup_can"][2, 3] > before["soup_can"][2, 3] + 0.05
+    with pytest.raises(Refused, match="not under way"):
+        bench.executor.on_stop(Halt(), bench.ctx)
+    home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
+    assert (home.success, home.number, home.held) == (True, 0, "")
+    assert bench.is_home()
+    assert np.linalg.norm(bench.poses()["soup_can"][:3, 3] - before["soup_can"][:3, 3]) < 0.01
+
+
+def test_a_stop_between_two_motions_is_heard() -> None:
+    bench = Bench(0, "tea")
+    before = bench.poses()
+    transfer = Transfer(
+        object="soup_can", source="table", destination="table", T_base_targets=standing("soup_can", 0.55, 0.45)[None],
+        pick="", place="",
+    )  # fmt: skip
+    read = bench.executor.on_transfer_request(
+        TransferRequest(transfer=transfer, scene=graph(before, bench.robot.table.height), number=1), bench.ctx
+    )
+    assert isinstance(read, RobotCommand)
+    state = bench.does(read)
+    bench.executor.on_stop(Halt(), bench.ctx)
+    outcome = bench.executor.on_robot_state(state, bench.ctx)
+    assert isinstance(outcome, Outcome) and outcome.failed_stage == STOPPED
+
+
+def test_an_object_that_falls_from_the_hand_is_noticed_at_once() -> None:
+    bench = Bench(0, "tea")
+    before, fell = bench.poses(), list[float]()
+
+    def let_fall(label: str) -> None:
+        if label == "carry soup_can" and not fell and bench.simulation.time > bench.states[-1].time + 0.5:
+            fell.append(bench.simulation.time)
+            bench.simulation.place("soup_can", standing("soup_can", 1.0, 0.0), settle=0.0)
+
+    bench.meddle = let_fall
+    outcome = bench.transfer(before, "soup_can", "table", standing("soup_can", 0.55, 0.45))
+    assert (outcome.success, outcome.failed_stage, outcome.held) == (False, "slip", "")
+    stopped = next(state for state in bench.states if state.stopped)
+    assert stopped.time - fell[0] < 0.2 + 0.1  # The fingers take a moment to close.
+    assert bench.is_home()
+
+
+def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> None:
+    bench = Bench(0, "tea")
+    before = bench.poses()
+    seen = {name: T for name, T in before.items() if name != "sugar_box"}
+    x, y = before["sugar_box"][:2, 3]
+    outcome = bench.transfer(seen, "cup", "table", standing("cup", x, y))
+    assert (outcome.success, outcome.failed_stage) == (False, "touch")
+    assert "N at the hand" in outcome.reason
+    assert bench.is_home()
+    after = bench.poses()
+    assert np.linalg.norm(after["cup"][:3, 3] - before["cup"][:3, 3]) < 0.02
+    assert after["sugar_box"][2, 2] > 0.99
 
 
 def test_states_between_transfers_are_ignored() -> None:

@@ -401,3 +401,17 @@ def test_what_makes_room_is_not_put_where_the_room_is_needed():
     found = plan(goal, start)
     assert found.status == "solved", found.reason
     assert reached(goal, executed(start, found))
+
+
+def test_what_hides_something_is_put_where_it_hides_nothing_of_that():
+    current = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2)
+    goal = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2).put("salt_shaker", 0.1, 0.0)
+    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=current.graph(), aside="milk_carton"))
+    (transfer,) = found.transfers
+    assert (transfer.object, transfer.source, transfer.destination) == ("milk_carton", "table", "table")
+    behind = Standing.at("salt_shaker", stances("salt_shaker"), goal.poses["salt_shaker"])
+    eye = (inverse(T_BASE_TABLE) @ T_BASE_CAMERA)[:3, 3]
+    for which in range(len(transfer.T_base_targets)):
+        after = executed(current, found, which=which)
+        carton = Standing.at("milk_carton", stances("milk_carton"), after.poses["milk_carton"])
+        assert hidden_share(behind, [carton], eye) == 0

@@ -29,3 +29,7 @@ class Fallen(Drawn):
                 put(draft, name, resting=self._lying[name])
             else:
                 put_somewhere(draft, name, rng, carried=0.0 if name in FIXED else 0.4, beside=0.25)
+
+    def stubborn(self, kind: Kind) -> set[str]:
+        """What lies so that no hand can take it is to be refused before anything moves."""
+        return set(self._lying) if kind == "start" else set()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from runner.contract import Refused
 from stages.devices.suites import tray
 from stages.devices.suites.biased import Biased
+from stages.devices.suites.disturbed import Disturbed
 from stages.devices.suites.fallen import Fallen
 from stages.devices.suites.hidden import Hidden
+from stages.devices.suites.slippery import Slippery
 from stages.devices.suites.suite import Drawn, Suite
 from stages.devices.suites.swap import Swap
 from stages.devices.suites.twins import Twins
@@ -22,6 +24,8 @@ DRAWN: dict[str, type[Drawn]] = {
     "biased": Biased,
     "hidden": Hidden,
     "fallen": Fallen,
+    "slippery": Slippery,
+    "disturbed": Disturbed,
 }
 """Those whose goals are drawn."""
 NAMES = (TRAY, *DRAWN)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.tabletop import HIDDEN, Layout
 from stages.geometry.arrays import Floats
@@ -33,6 +36,9 @@ class Suite(ABC):
     joints = 0.0
     """Radians by which encoders are off at most."""
 
+    factors: Mapping[str, Factors] = MappingProxyType({})
+    """Objects that are not as the catalogue has them."""
+
     @abstractmethod
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """One draw of a scene.
@@ -40,6 +46,13 @@ class Suite(ABC):
         Raises:
             Rejected: it is impossible.
         """
+
+    def meddle(self, simulation: Simulation, seconds: float) -> str:
+        """Called after every ``seconds`` in which the robot moves or looks; says in words what has happened, if it has.
+
+        Begins with the start scene.
+        """
+        return ""
 
 
 class Drawn(Suite):
@@ -60,6 +73,10 @@ class Drawn(Suite):
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """Puts the objects of a scene down; raises :class:`Rejected` where there is no room."""
 
+    def stubborn(self, kind: Kind) -> set[str]:
+        """Objects for which there need be no grasp."""
+        return set()
+
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """Puts a draft together and tests whether the robot could take it apart."""
         # Motion planning takes half a second to load; whoever only reads a graph does without.
@@ -67,7 +84,7 @@ class Drawn(Suite):
 
         draft = Draft(self.catalogue, self._shapes, rng, robot=self.robot, table=self.table, hidden=self.hidden[kind])
         self.draw(kind, draft, rng)
-        if stuck(self.robot, draft.placed, draft.supports, self.table):
+        if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
         return draft.layout
 

@@ -212,6 +212,30 @@ class Account(Stage):
         return Sum(total=self._total, calls=self._calls) if self._left == 0 else None
 
 
+class Walker(Stage):
+    """Walks until something else tells it how far it was to go."""
+
+    device = True
+
+    def __init__(self):
+        self._goal = 0
+
+    def on_number(self, number: Number, ctx: Context) -> Iterator[Finished | None]:
+        walked = 0
+        try:
+            while not self._goal:
+                time.sleep(0.01)
+                walked += 1
+                yield None
+        except GeneratorExit:
+            ctx.log(f"stands after {walked} steps" if walked else "has not begun")
+            raise
+        yield Finished(code=0, reason=f"arrived at {self._goal} after {walked} steps")
+
+    def on_goal(self, goal: Number) -> None:
+        self._goal = goal.value + 1
+
+
 class RestartWatcher(Stage):
     """Shows restarts."""
 

@@ -8,7 +8,9 @@ from msgspec.structs import replace
 
 from runner.contract import Refused
 from runner.testing import run_stage
+from stages.devices.servo import PIECE
 from stages.devices.simulated_camera import SimulatedCamera
+from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.suites.reach import stuck
@@ -147,3 +149,44 @@ def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
     with pytest.raises(Refused, match=r"world\.goal: suite wild draws its goals"):
         World.Config(suite="wild", goal="tea")
     assert set(kinds.DRAWN) == set(kinds.NAMES) - {"tray"}
+
+
+def meddled(suite: str, seed: int, *, pieces: int) -> tuple[str, Simulation]:
+    """What happens in a world while the arm stands at home, and the world after it."""
+    world, said = World(World.Config(suite=suite, seed=seed)), list[str]()
+    still = RobotCommand(
+        joint_names=("head_pan_joint",), times=np.array([0.0, pieces * PIECE]), positions=np.zeros((2, 1)),
+        velocities=np.zeros((2, 1)),
+    )  # fmt: skip
+    run_stage(world, [Arrangement(kind="start"), still], log=lambda text, _: said.append(text))
+    return "\n".join(said), world._simulation  # pyright: ignore[reportPrivateUsage]
+
+
+def test_somebody_brings_moves_and_returns_objects_while_the_robot_works() -> None:
+    said, simulation = meddled("disturbed", 1, pieces=1600)
+    assert "somebody" in said.split("laid out")[1]
+    assert set(simulation.present) >= set(said.split("laid out: ")[1].split(";")[0].split("\n")[0].split(", "))
+    assert (simulation.object_poses()[:, 2, 2] > 0.99).all()
+
+
+def test_slippery_objects_are_not_as_the_catalogue_has_them_and_fall_from_the_hand() -> None:
+    world = kinds.suite("slippery", CATALOGUE, ROBOT, 0)
+    factors = [value for one in world.factors.values() for value in (one.mass, one.friction)]
+    assert min(factors) >= 0.5 and max(factors) <= 1.5 and np.ptp(factors) > 0.3
+
+    class Hand(Simulation):
+        """Holds a cup all the time."""
+
+        def __init__(self) -> None:
+            self.pads: list[float] = []
+
+        def held(self) -> str:
+            return "" if self.pads else "cup"
+
+        def slide(self, factor: float) -> None:
+            self.pads.append(factor)
+
+    hands = [Hand() for _ in range(20)]
+    said = [{world.meddle(hand, PIECE) for _ in range(60)} for hand in hands]
+    assert {"cup falls from the hand"} < set.union(*said)
+    assert sum(hand.pads == [0.01, 1.0] for hand in hands) == 3

@@ -139,3 +139,16 @@ def test_what_is_in_no_goal_must_stay() -> None:
     assert losses(pushed) == ["mug is in no goal and was moved, and nobody said so"]
     carried = outcome(1, transfer("mug", "table", "table"))
     assert losses(pushed, carried) == ["mug is in no goal and was moved, as was said"]
+
+
+def test_what_is_brought_later_must_stay_where_it_was_put() -> None:
+    def losses(y: float) -> list[str]:
+        brought = SHOWN.poses | {"mug": Layout().put("mug", -0.1, 0.3).poses["mug"]}
+        final = SHOWN.poses | {"mug": Layout().put("mug", -0.1, y).poses["mug"]}
+        layouts = {"goal": SHOWN, "start": START, "after transfer 1": Layout(brought), "end": Layout(final)}
+        looks = [snapshot(layout, purpose) for purpose, layout in layouts.items()]
+        goal = Goal(name="tea", scene=SHOWN.graph(), pddl="")
+        return [str(loss) for loss in TRUTH.judge(looks, goal, verdict(SHOWN, SHOWN), ()).losses]
+
+    assert losses(0.3) == []
+    assert losses(0.36) == ["mug is in no goal and was moved, and nobody said so"]

@@ -1,0 +1,191 @@
+"""The simulated robot's controllers: they follow, grip, watch what they measure, and brake."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from stages.geometry.arrays import Floats
+from stages.messages import RobotCommand
+from stages.messages.robot import Guard, Stopped
+from stages.robots import Robot
+
+PIECE = 0.05
+"""Simulated seconds after which a motion lets others in."""
+BRAKE = 0.1
+"""Seconds in which the arm comes to a stand."""
+_SETTLE = 0.25
+_GRIPPER_RAMP = 0.6
+"""Seconds over which a new gripper opening is commanded."""
+_GRIPPER_HOLD = 0.3
+"""Seconds for the fingers to stall or arrive."""
+_FILTER = 0.03
+"""Seconds over which efforts are smoothed: servos answer a jump of the acceleration with a delay."""
+_SHORTEST_LEVER = 0.2
+"""Metres: of joints whose axis passes closer to the hand hardly any force is felt, only friction."""
+
+
+class Servo:
+    """Position servos with feed-forward of velocities and of the efforts that the motion takes.
+
+    Whatever else the motors must do is a force from outside. Only encoders and motor efforts are read.
+    """
+
+    def __init__(self, robot: Robot, model: Any, data: Any, step: Callable[[], None]) -> None:
+        """``step`` lets one time step of the physics pass."""
+        self._robot, self._model, self._data, self._step = robot, model, data, step
+        self._timestep = float(model.opt.timestep)
+        moved = {
+            k: model.joint(model.actuator_trnid[k, 0]).name
+            for k in range(model.nu)
+            if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT
+        }
+        self.actuators = {name: k for k, name in moved.items()}
+        """By the joint that each moves."""
+        self.fingers = np.array([k for k in range(model.nu) if moved.get(k) not in robot.posture])
+        self._hand = model.body(robot.gripper.link).id
+        alone = robot.specification(seen=False)
+        alone.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self._bare = alone.compile()
+        self._bare_data = mujoco.MjData(self._bare)
+        self._asked = False
+        self.error = 0.0
+        """Largest joint error of the newest command, radians."""
+        self.force = 0.0
+        """Largest force from outside that was felt meanwhile, as if it acted on the hand, newtons."""
+        self.stopped: Stopped = ""
+        """Why the newest command was not carried out to its end."""
+        self.reason = ""
+
+    def brake(self) -> None:
+        """Has what is under way come to a stand at once; held things stay held."""
+        self._asked = True
+
+    def carry_out(self, command: RobotCommand) -> Iterator[None]:
+        """Follows a trajectory, then drives the fingers; lets others in after every piece of it."""
+        self._asked, self.error, self.force, self.stopped, self.reason = False, 0.0, 0.0, "", ""
+        ended = False
+        try:
+            if len(command.times):
+                yield from self._follow(command)
+            if command.gripper_width is not None and not self.stopped:
+                yield from self._grip(command.gripper_width)
+            ended = not self.stopped
+        finally:
+            if not ended:
+                self._stand()
+
+    def opening(self) -> float:
+        """Metres between the fingers."""
+        gripper = self._robot.gripper
+        return sum(gripper.width(float(self._data.joint(name).qpos[0])) for name in gripper.fingers) / 2
+
+    def grip(self, width: float) -> Floats:
+        """What is commanded to the actuators of the fingers; their own range need not be that of the joints."""
+        gain, bias = self._model.actuator_gainprm[self.fingers, 0], self._model.actuator_biasprm[self.fingers, 1]
+        return self._robot.gripper.finger_position(width) * (-bias / gain)
+
+    def _follow(self, command: RobotCommand) -> Iterator[None]:
+        joints = [self._model.joint(name) for name in command.joint_names]
+        actuators = np.array([self.actuators[name] for name in command.joint_names])
+        addresses, dofs = (np.array([getattr(j, key)[0] for j in joints]) for key in ("qposadr", "dofadr"))
+        gain = self._model.actuator_gainprm[actuators, 0]
+        lag = -self._model.actuator_biasprm[actuators, 2] / gain
+        targets, rates, efforts = self._resample(command)
+        arm = np.array([self._robot.body.turns(name) for name in command.joint_names])
+        still, felt = self._data.actuator_force[actuators].copy(), np.zeros(len(actuators))
+        for k, (target, rate, effort) in enumerate(zip(targets, rates, efforts, strict=True), 1):
+            self._data.ctrl[actuators] = target + lag * rate + effort / gain
+            self._step()
+            self.error = max(self.error, float(np.abs(self._data.qpos[addresses] - target).max()))
+            # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
+            outside = self._data.actuator_force[actuators] - still - effort
+            felt += (outside - felt) * self._timestep / _FILTER
+            self.force = max(self.force, float((np.abs(felt) / self._levers(dofs))[arm].max()))
+            if self._is_wrong(command.guard):
+                return
+            if k % round(PIECE / self._timestep) == 0:
+                yield
+                if self._is_wrong(None):
+                    return
+        self._data.ctrl[actuators] = targets[-1]
+        yield from self._wait(_SETTLE, command.guard)
+
+    def _grip(self, width: float) -> Iterator[None]:
+        """The fingers stall with limited force at what is between them."""
+        start, end = self._data.ctrl[self.fingers].copy(), self.grip(width)
+        pieces = round(_GRIPPER_RAMP / PIECE)
+        for k in range(1, pieces + 1):
+            self._data.ctrl[self.fingers] = start + (end - start) * k / pieces
+            yield from self._wait(PIECE, None)
+            if self.stopped:
+                return
+        yield from self._wait(_GRIPPER_HOLD, None)
+
+    def _wait(self, seconds: float, guard: Guard | None) -> Iterator[None]:
+        for _ in range(round(seconds / PIECE)):
+            for _ in range(round(PIECE / self._timestep)):
+                self._step()
+            yield
+            if self._is_wrong(guard):
+                return
+
+    def _is_wrong(self, guard: Guard | None) -> bool:
+        """Whether the robot must stop, and why."""
+        if self._asked:
+            self.stopped, self.reason = "stop", "as asked"
+        elif guard is not None and not guard.narrowest <= self.opening() <= guard.widest:
+            self.stopped, self.reason = "slip", f"the fingers are {1e3 * self.opening():.0f} mm apart"
+        elif guard is not None and self.force > guard.force:
+            self.stopped, self.reason = "touch", f"{self.force:.0f} N at the hand"
+        elif guard is not None and self.error > guard.error:
+            self.stopped, self.reason = "touch", f"a joint is {np.rad2deg(self.error):.1f} degrees off"
+        return bool(self.stopped)
+
+    def _stand(self) -> None:
+        """Every joint slows down evenly and then stays."""
+        moving = np.setdiff1d(np.arange(self._model.nu), self.fingers)
+        joints = self._model.actuator_trnid[moving, 0]
+        position = self._data.qpos[self._model.jnt_qposadr[joints]].copy()
+        rate = self._data.qvel[self._model.jnt_dofadr[joints]].copy()
+        steps = round(BRAKE / self._timestep)
+        lag = -self._model.actuator_biasprm[moving, 2] / self._model.actuator_gainprm[moving, 0]
+        for k in range(steps):
+            slower = rate * (1 - (k + 1) / steps)
+            position += slower * self._timestep
+            self._data.ctrl[moving] = position + lag * slower
+            self._step()
+
+    def _levers(self, dofs: Any) -> Floats:
+        """Metres between the hand and each joint's axis."""
+        linear = np.zeros((3, self._model.nv))
+        mujoco.mj_jacBody(self._model, self._data, linear, None, self._hand)
+        return np.maximum(np.linalg.norm(linear[:, dofs], axis=0), _SHORTEST_LEVER)
+
+    def _resample(self, command: RobotCommand) -> tuple[Floats, Floats, Floats]:
+        """The trajectory at every time step of the simulation, and the efforts that it takes."""
+        times = command.times
+        if len(times) < 2:
+            return command.positions, command.velocities, np.zeros_like(command.positions)
+        spline = CubicHermiteSpline(times, command.positions, command.velocities)
+        steps = np.minimum(np.arange(1, round(times[-1] / self._timestep) + 1) * self._timestep, times[-1])
+        efforts = self._efforts(command, np.gradient(command.velocities, times, axis=0))
+        return spline(steps), spline(steps, 1), np.stack([np.interp(steps, times, one) for one in efforts.T], axis=1)
+
+    def _efforts(self, command: RobotCommand, accelerations: Floats) -> Floats:
+        """T x J, newton metres (newtons) that a trajectory takes with nothing in the hand: inverse dynamics."""
+        model, data = self._bare, self._bare_data
+        joints = [model.joint(name) for name in command.joint_names]
+        addresses, dofs = (np.array([getattr(joint, key)[0] for joint in joints]) for key in ("qposadr", "dofadr"))
+        for name, position in self._robot.posture.items():
+            data.joint(name).qpos[0] = position
+        result = np.zeros_like(command.positions)
+        for k, (q, v, a) in enumerate(zip(command.positions, command.velocities, accelerations, strict=True)):
+            data.qpos[addresses], data.qvel[dofs], data.qacc[dofs] = q, v, a
+            mujoco.mj_inverse(model, data)
+            result[k] = data.qfrc_inverse[dofs]
+        return result
