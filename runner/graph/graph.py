@@ -17,7 +17,7 @@ from msgspec import Meta
 from runner.contract import Command, Finished, Message, Part, Refused, Restarted, Stage
 from runner.graph.document import Document, Keys, read_document, suggest
 from runner.graph.packaged import locate
-from runner.graph.placement import ALONE, Layout, check_listen, read_layout, read_placement
+from runner.graph.placement import ALONE, Layout, check_listen, read_layout
 from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_shared
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
@@ -254,10 +254,15 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
         return found
 
     def outputs_of(self, stage: str) -> dict[str, type[Message]]:
-        """Output ports of a stage or of the supervisor."""
+        """Output ports of a stage or of the supervisor; none of what is neither."""
         if stage == SUPERVISOR:
             return {port_name(Restarted): Restarted, **self.commands()}
-        return self.nodes[stage].type.outputs
+        return self.nodes[stage].type.outputs if stage in self.nodes else {}
+
+    def topics(self) -> dict[str, type[Message]]:
+        """Every output port, as ``STAGE/PORT``; the supervisor's last."""
+        stages = (*self.nodes, SUPERVISOR)
+        return {f"{stage}/{port}": kind for stage in stages for port, kind in self.outputs_of(stage).items()}
 
     def commands(self) -> dict[str, type[Command]]:
         """What the supervisor publishes when a command is called, by output port."""
@@ -266,6 +271,14 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
             for node in self.nodes.values()
             for name, kind in node.type.commands.items()
         }
+
+    def load(self, key: str, reference: str) -> Any:
+        """An instance of the class ``module:Class`` that a key names, given the settings of every stage by its name.
+
+        Raises Refused where there is no such class.
+        """
+        cls = load_class(reference, f"{key} of graph {self.name!r}")
+        return cls({name: node_entry(node)["config"] for name, node in self.nodes.items()})
 
     def processes(self) -> list[tuple[str, int]]:
         """(stage, replica) of every process."""
@@ -518,7 +531,11 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
 
 def _placement(document: Document, name: str, entry: StageEntry) -> tuple[str, ...]:
     """The host of each replica, which a count by host or ``replicas`` says, and where both do they agree."""
-    counts = read_placement(document, name, entry.host)
+    counts = {entry.host: 1} if isinstance(entry.host, str) else entry.host or {}
+    hosts = document.values.get("hosts") or {}
+    for host in counts:
+        if host not in hosts:
+            raise Refused(f"{document.place('stages', name, 'host')}: no host {host!r}{suggest(host, hosts)}")
     stated = "replicas" in document.values["stages"][name]
     if counts and stated and entry.replicas == "auto":
         place = document.place("stages", name, "replicas")

@@ -264,16 +264,6 @@ def check_listen(document: Document, layout: Layout) -> None:
         )
 
 
-def read_placement(document: Document, stage: str, value: str | Mapping[str, int] | None) -> Mapping[str, int]:
-    """Replicas by host from ``host: NAME`` or ``host: {NAME: REPLICAS}``; empty where none is named."""
-    counts = {value: 1} if isinstance(value, str) else value or {}
-    names = _entries(document)
-    for name in counts:
-        if name not in names:
-            raise Refused(f"{document.place('stages', stage, 'host')}: no host {name!r}{suggest(name, names)}")
-    return counts
-
-
 def choose_host(layout: Layout, name: str | None, file: Path) -> str | None:
     """The host whose processes this machine starts; None where the graph names none. Raises Refused with the names."""
     if not layout.hosts:
@@ -288,6 +278,16 @@ def choose_host(layout: Layout, name: str | None, file: Path) -> str | None:
     if name is not None and name not in layout.names:
         raise Refused(f"--host {name}: no such host{suggest(name, layout.names)}")
     return name or layout.head.name
+
+
+def refuse_settings(settings: tuple[str, ...], host: str) -> None:
+    """Settings come from the head with each task; only how to reach it is a host's own. Raises Refused for others."""
+    for setting in settings:
+        key = setting.partition("=")[0]
+        if not (key.startswith("hosts.") or key in ("keys", "router")):
+            raise Refused(
+                f"--set {setting}: settings are the head's, which gives them to {host} with its tasks; type it there"
+            )
 
 
 def _ip(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

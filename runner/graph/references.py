@@ -61,11 +61,7 @@ def _table(
 
 
 def _is_version(key: Any) -> bool:
-    match key:
-        case (str(), int()):
-            return True
-        case _:
-            return False
+    return isinstance(key, tuple) and [type(part) for part in key] == [str, int]
 
 
 def _module(name: str, place: str) -> Any:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Refused
 from runner.graph.document import Document
 from runner.graph.placement import read_layout
 from runner.hosts.head import (
@@ -30,7 +29,7 @@ from runner.hosts.head import (
     introduce,
     network_of,
 )
-from runner.message.packet import Packet, Process
+from runner.message.packet import Process
 from runner.process.children import Family, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
@@ -91,7 +90,8 @@ class Agent:
 
     def _take_part(self) -> Dismiss:
         """Raises Refused with the head's reason where it does not take this host in."""
-        self._bus.subscribe(f"order/{self._host}/{self._session}", self._on_order)
+        path = f"order/{self._host}/{self._session}"
+        self._bus.subscribe(path, lambda packet: self._events.put(msgspec.json.decode(packet.payload, type=Order)))
         self._bus.watch(self._on_presence)
         self._bus.announce()
         while not self._head_is_there:
@@ -105,9 +105,6 @@ class Agent:
         self._folder = (self._recordings / run).absolute()
         (self._folder / "log").mkdir(parents=True, exist_ok=True)
         return self._serve()
-
-    def _on_order(self, packet: Packet) -> None:
-        self._events.put(msgspec.json.decode(packet.payload, type=Order))
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if process.stage == self._network.head:
@@ -186,13 +183,3 @@ class Agent:
 
     def _say(self, text: str) -> None:
         self._terminal.show(self._host, text)
-
-
-def refuse_settings(settings: tuple[str, ...], host: str) -> None:
-    """Settings come from the head with each task; only how to reach it is a host's own. Raises Refused for others."""
-    for setting in settings:
-        key = setting.partition("=")[0]
-        if not (key.startswith("hosts.") or key in ("keys", "router")):
-            raise Refused(
-                f"--set {setting}: settings are the head's, which gives them to {host} with its tasks; type it there"
-            )

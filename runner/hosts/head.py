@@ -35,17 +35,10 @@ from runner.inspect.compare import SHOWN, clipped
 from runner.message.packet import Packet, Process
 from runner.process.children import Handle
 from runner.process.stage_process import Assignment
-from runner.recording.provenance import (
-    fingerprint,
-    machine,
-    package_versions,
-    revision,
-    runner_version,
-    with_texts,
-)
+from runner.recording import provenance
 from runner.terminal import listed
 from runner.transport.bus import Bus
-from runner.transport.session import Router, private
+from runner.transport.session import open_session, private
 
 ABSENT_SECONDS = 60.0
 """How long a host that is cut off may stay away while a stage has no other process."""
@@ -190,7 +183,8 @@ class Hosts:
         self._present: set[Process] = set()
         self._changed = threading.Condition(threading.RLock())
         self._remind_at = time.monotonic()
-        self._router = Router(self.endpoint, network) if layout.router_is_head else None
+        self._router = open_session([self.endpoint], [], network, mode="router") if layout.router_is_head else None
+        """Forwards between the sessions of a routed network, which do not link to each other."""
         own = Process(network.head, 0, secrets.randbits(24))
         self._bus = Bus(control(name), self.endpoint, network=network, process=own, listen=not network.routed)
 
@@ -339,14 +333,15 @@ def introduce(document: Document, host: str, session: int) -> Hello:
     written = read_document(Path(document.label)).values
     named = document.values.get("numerical")
     names = map(str, cast("list[Any]", named)) if isinstance(named, list) else NUMERICAL
+    revision = provenance.revision(document.values)
     return Hello(
         host=host,
         session=session,
         graph=msgspec.json.encode(written, enc_hook=str).decode(),
         folder=str(document.folder),
         cwd=str(Path.cwd()),
-        fingerprint=fingerprint(machine(), package_versions(), names),
-        source=f"runner {runner_version()}, stages {revision(document.values) or 'of unknown revision'}",
+        fingerprint=provenance.fingerprint(provenance.machine(), provenance.package_versions(), names),
+        source=f"runner {provenance.runner_version()}, stages {revision or 'of unknown revision'}",
     )
 
 
@@ -376,7 +371,7 @@ def moved(value: Any, folders: Mapping[str, str]) -> Any:
         start = next((old for old in folders if text.startswith(f"{old}/")), None)
         return portable_name(Path(text)) or (text if start is None else folders[start] + text[len(start) :])
 
-    return with_texts(value, there)
+    return provenance.with_texts(value, there)
 
 
 def _read(file: Path, offset: int) -> bytes:

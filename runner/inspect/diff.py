@@ -10,7 +10,7 @@ from runner.inspect.compare import Difference, envelope_differences
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.ids import MessageId
-from runner.recording.provenance import changed_packages
+from runner.recording.provenance import changes
 from runner.recording.recording import Recording
 
 HEADER = ("lineage", "type", "version", "causes")
@@ -67,5 +67,5 @@ def _origins(first: Recording, second: Recording) -> Iterator[str]:
         pair = first.run.get(name, ""), second.run.get(name, "")
         if pair[0] != pair[1]:
             yield f"{name}: {pair[0] or 'unknown'} and {pair[1] or 'unknown'}"
-    packages = [recording.aspect("packages", dict[str, str]()) for recording in (first, second)]
-    yield from changed_packages(*packages)
+    ours, theirs = (recording.aspect("packages", dict[str, str]()) for recording in (first, second))
+    yield from changes(ours, theirs, sorted({*ours, *theirs}, key=str.lower))

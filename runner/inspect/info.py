@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from runner.contract import Restarted
 from runner.graph.graph import SUPERVISOR
 from runner.graph.ports import port_name
@@ -88,16 +90,9 @@ class Durations:
     @property
     def median(self) -> float:
         """The middle one, or the mean of the two in the middle; there must be one."""
-        count = sum(number for number, _ in self._like.values())
-        return (self._at((count - 1) // 2) + self._at(count // 2)) / 2
-
-    def _at(self, place: int) -> float:
-        """The one at a place in order of length, from 0."""
-        for _, (number, total) in sorted(self._like.items()):
-            if place < number:
-                return total / number
-            place -= number
-        raise IndexError(place)
+        numbers, sums = np.array([like for _, like in sorted(self._like.items())]).T
+        middle = (numbers.sum() - 1) // 2, numbers.sum() // 2
+        return float((sums / numbers)[np.searchsorted(numbers.cumsum(), middle, side="right")].mean())
 
 
 class StageTimes:
@@ -154,9 +149,8 @@ def _complaints(recording: Recording) -> Iterator[str]:
     yield from (f"damage at {damage}" for damage in recording.damage)
     yield from (f"missing {id}" for id in recording.verdict.missing)
     yield from (f"lost {one.stage}/{one.replica}/{one.incarnation}: {one.reason}" for one in recording.lost)
-    repeated = sum(count > 0 for count in recording.repeated.values())
-    if repeated:
-        yield f"{repeated} messages were sent again after a restart"
+    if recording.repeated:
+        yield f"{len(recording.repeated)} messages were sent again after a restart"
     for line in recording.log:
         if line.level in ("warning", "error"):
             yield f"{line.level} of {line.stage}[{line.replica}]: {line.text}"

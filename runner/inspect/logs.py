@@ -11,7 +11,7 @@ from mcap.records import Metadata
 
 from runner.contract import Refused
 from runner.message.codec import CodecError, LogLine, unpack
-from runner.recording.container import Container, Growing, open_file
+from runner.recording.container import Container, Growing, open_file, recordings_in
 from runner.recording.recording import LOG
 
 
@@ -34,7 +34,7 @@ def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:
 
 def newest_recording(folder: Path) -> Path:
     """The recording that was begun last; raises Refused where there is none."""
-    found = max(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
-    if found is None:
+    found = recordings_in(folder)
+    if not found:
         raise Refused(f"{folder}: no recordings; start a graph: runner up GRAPH, or name a folder: --recordings DIR")
-    return found
+    return found[0]

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import queue
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -28,7 +26,7 @@ RESTART_SECONDS = 300.0
 WINDOW_NS = 10_000_000_000
 """Rates are taken over the last ten seconds."""
 BACKLOG = 1000
-"""Messages that a slow terminal may fall behind; the rest is left out."""
+"""Messages that a slow terminal may fall behind; what is older is left out."""
 
 
 class Header(NamedTuple):
@@ -40,26 +38,7 @@ class Header(NamedTuple):
     """Bytes of the envelope."""
 
 
-class Backlog:
-    """What a terminal has still to show of some messages."""
-
-    def __init__(self, bus: Bus, path: str) -> None:
-        self._packets: queue.Queue[Packet] = queue.Queue(BACKLOG)
-        bus.hand_over(path, self._receive)
-
-    def take(self, timeout_s: float) -> Iterator[Packet]:
-        """What has arrived; waits for the first, but not for longer than ``timeout_s``."""
-        with contextlib.suppress(queue.Empty):
-            yield self._packets.get(timeout=timeout_s)
-            while True:
-                yield self._packets.get_nowait()
-
-    def _receive(self, packet: Packet) -> None:
-        with contextlib.suppress(queue.Full):
-            self._packets.put_nowait(packet)
-
-
-class Live:
+class Live(contextlib.AbstractContextManager["Live"]):
     """A connection to one run, to be used in a ``with`` statement."""
 
     def __init__(self, entry: Entry) -> None:
@@ -70,10 +49,7 @@ class Live:
         except Refused as refusal:
             raise Refused(f"{entry.run}: cannot be reached: {refusal}") from None
 
-    def __enter__(self) -> Live:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.bus.close()
 
     def status(self) -> RunStatus:
@@ -118,25 +94,28 @@ class Live:
 
     def messages(self, topic: str) -> Iterator[Packet]:
         """Messages of a topic (``stage/port``) from now on, until the run ends."""
-        backlog = Backlog(self.bus, f"m/{self._known(topic)}")
-        while True:
-            packets = list(backlog.take(POLL_SECONDS))
-            yield from packets
-            if not packets and not is_alive(self.entry):
-                return
+        backlog = deque[Packet](maxlen=BACKLOG)
+        self.bus.hand_over(f"m/{self._known(topic)}", backlog.append)
+        lives = True
+        while lives:
+            lives = is_alive(self.entry)
+            while backlog:
+                yield backlog.popleft()
+            time.sleep(POLL_SECONDS)
 
     def headers(self, topic: str) -> Iterator[list[Header]]:
         """Once a second the headers of the last ten seconds, until the run ends."""
-        backlog, window = Backlog(self.bus, f"m/{self._known(topic)}"), deque[Header]()
-        due = time.monotonic() + 1.0
+        window = deque[Header]()
+
+        def enter(packet: Packet) -> None:
+            window.append(Header(packet.sent_ns, packet.arrived_ns, len(packet.payload)))
+
+        self.bus.hand_over(f"m/{self._known(topic)}", enter)
         while is_alive(self.entry):
-            packets = backlog.take(POLL_SECONDS)
-            window += (Header(packet.sent_ns, packet.arrived_ns, len(packet.payload)) for packet in packets)
-            if time.monotonic() >= due:
-                due += 1.0
-                while window and window[0].arrived_ns < time.monotonic_ns() - WINDOW_NS:
-                    window.popleft()
-                yield list(window)
+            time.sleep(1.0)
+            while window and window[0].arrived_ns < time.monotonic_ns() - WINDOW_NS:
+                window.popleft()
+            yield list(window)
 
     def _known(self, topic: str) -> str:
         """The topic as its key spells it; raises Refused where the run has none of that name."""

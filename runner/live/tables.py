@@ -18,6 +18,7 @@ from runner.inspect.info import byte_count, seconds, table
 from runner.live.live import Header
 from runner.message.codec import LogLine
 from runner.supervise.calls import CommandType, Progress
+from runner.supervise.registry import Entry
 from runner.supervise.status import Flow, ProcessStatus, RunStatus
 from runner.terminal import Terminal
 
@@ -29,11 +30,11 @@ SHOWN_LINES = 24
 # ------------------------------------------------------------------------------------------ processes, topics
 
 
-def status_text(status: RunStatus) -> str:
+def status_text(entry: Entry, status: RunStatus) -> str:
     """A run in one line, and its processes in a table."""
-    age = seconds((time.time() - status.started) * 1e9)
-    recording = from_here(status.recording)
-    head = f"{status.run}: {from_here(status.graph)}, up {age}, {status.endpoint}, recording {recording}"
+    age = seconds((time.time() - entry.started) * 1e9)
+    recording = from_here(entry.recording)
+    head = f"{entry.run}: {from_here(entry.graph)}, up {age}, {status.endpoint}, recording {recording}"
     titles = ("process", "state", "pid", "cpu", "memory", "queue", "steps/s", "restarts", "last reason")
     return "\n".join((head, *table(titles, map(_process_row, status.processes))))
 

@@ -72,13 +72,23 @@ class Envelope(msgspec.Struct, frozen=True):
     body: msgspec.Raw
 
 
-class Step(msgspec.Struct, frozen=True):
-    """One journalled step of one stage: what it consumed and emitted, in which order, and how long it took."""
+class OfProcess(msgspec.Struct, frozen=True):
+    """What begins with the process that it speaks of."""
 
     stage: str
     replica: Count
     incarnation: Count
     """0 for the first process of this replica, one more after each restart."""
+
+    @property
+    def process(self) -> Process:
+        """Of whom it speaks."""
+        return Process(self.stage, self.replica, self.incarnation)
+
+
+class Step(OfProcess, frozen=True):
+    """One journalled step of one stage: what it consumed and emitted, in which order, and how long it took."""
+
     number: Count
     """Counts the steps of one process from 0."""
     handler: str
@@ -100,26 +110,13 @@ class Step(msgspec.Struct, frozen=True):
     """(port, message id) of what has arrived and no step of this process will consume: it was refused, or put aside
     unused, or the process ended before; said once."""
 
-    @property
-    def process(self) -> Process:
-        """Whose it is."""
-        return Process(self.stage, self.replica, self.incarnation)
 
-
-class Lost(msgspec.Struct, frozen=True):
+class Lost(OfProcess, frozen=True):
     """The supervisor's word that a process is dead, whatever else is heard of it: the one thing that makes it so."""
 
-    stage: str
-    replica: Count
-    incarnation: Count
     reason: str
     time_ns: Nanoseconds
     """Wall clock, nanoseconds since the epoch."""
-
-    @property
-    def process(self) -> Process:
-        """Who is dead."""
-        return Process(self.stage, self.replica, self.incarnation)
 
 
 def answered(step: Step) -> tuple[tuple[str, IdText], ...]:
@@ -152,15 +149,9 @@ class LogLine(msgspec.Struct, frozen=True):
     """Wall clock, nanoseconds since the epoch."""
 
 
-class Pulse(msgspec.Struct, frozen=True):
+class Pulse(OfProcess, frozen=True):
     """What a process says of itself twice a second, of the recorder too; it is not recorded."""
 
-    stage: str
-    replica: int
-    incarnation: int
-    pid: int
-    host: str
-    """Name of the machine."""
     state: Activity = "waiting"
     handler: str = ""
     """What runs at present; empty while waiting."""
@@ -170,11 +161,7 @@ class Pulse(msgspec.Struct, frozen=True):
     refused: int = 0
     """Messages that could not be taken."""
     queued: dict[str, int] = {}
-    """Messages that have arrived and are not worked on, by input port."""
-    skipped: dict[str, int] = {}
-    """Messages that newer ones replaced before they were read, by input port."""
-    unanswered: dict[str, int] = {}
-    """Messages that consumers have not done with, by ``stage.port`` of the consumer."""
+    """Messages that have arrived and are not worked on, by where they wait: an input port, or before it is known."""
     sent: dict[str, tuple[int, int]] = {}
     """(messages, bytes) emitted so far, by output port."""
     cpu_ns: int = 0

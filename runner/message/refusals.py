@@ -6,9 +6,10 @@ from typing import TypeVar
 
 import msgspec
 
+from runner.contract import Refused
 from runner.message import codec
 from runner.message.codec import CodecError
-from runner.message.packet import Packet
+from runner.message.packet import Packet, Process
 
 R = TypeVar("R", bound=msgspec.Struct)
 SHOWN = 10
@@ -23,13 +24,29 @@ class Refusals:
         self._show = show
         self._counting = threading.Lock()
 
-    def read(self, kind: type[R], packet: Packet) -> R | None:
-        """The record that has been sent, or None: then it is refused."""
-        try:
-            return codec.unpack(kind, packet.payload)
-        except CodecError as error:
-            self.refuse(packet.key, error)
-            return None
+    def reading(self, kind: type[R], note: Callable[[R, Packet], None]) -> Callable[[Packet], None]:
+        """Takes packets and has every record noted; what is not of its kind is refused."""
+
+        def take(packet: Packet) -> None:
+            try:
+                record = codec.unpack(kind, packet.payload)
+            except CodecError as error:
+                self.refuse(packet.key, error)
+            else:
+                note(record, packet)
+
+        return take
+
+    def naming(self, note: Callable[[Process], None]) -> Callable[[Packet], None]:
+        """Takes packets and has every process noted that a key names; a key that names none is refused."""
+
+        def take(packet: Packet) -> None:
+            try:
+                note(Process.of(packet.key))
+            except Refused as refusal:
+                self.refuse(packet.key, refusal)
+
+        return take
 
     def refuse(self, key: str, error: Exception) -> None:
         """Counts a message and shows what is wrong with it; of very many only some."""

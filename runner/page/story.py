@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.contract import Message
-from runner.graph.graph import Graph, node_entry
-from runner.graph.references import load_class
+from runner.graph.graph import Graph
 
 Language = Literal["en", "de"]
 Surety = Literal["sure", "unsure", "doubtful", "unknown"]
@@ -215,7 +214,4 @@ class Story(Protocol):
 
 def load_story(graph: Graph) -> Story | None:
     """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""
-    if graph.story is None:
-        return None
-    story = load_class(graph.story, f"story of graph {graph.name!r}")
-    return story({name: node_entry(node)["config"] for name, node in graph.nodes.items()})
+    return None if graph.story is None else graph.load("story", graph.story)

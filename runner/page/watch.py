@@ -17,7 +17,7 @@ from pathlib import Path
 from mcap.records import Metadata
 
 from runner.contract import Message
-from runner.graph.graph import SUPERVISOR, Graph, graph_from_json
+from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import CodecError, Envelope, LogLine, open_envelope, unpack
 from runner.page.story import Doing, Heard, Language, Story, Told, load_story
 from runner.recording.container import POLL_SECONDS, Container, Entry, Growing, open_file
@@ -87,12 +87,7 @@ class Watch:
     def _prepare(self, graph: Graph) -> None:
         story = load_story(graph)
         if story is not None:
-            self._heard = {
-                f"{stage}/{port}": kind
-                for stage in (*graph.nodes, SUPERVISOR)
-                for port, kind in graph.outputs_of(stage).items()
-                if issubclass(kind, story.hears)
-            }
+            self._heard = {topic: kind for topic, kind in graph.topics().items() if issubclass(kind, story.hears)}
         self._story, self._prepared = story, True
 
     def _hear(self, kind: type[Message], entry: Entry) -> None:

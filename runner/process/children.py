@@ -76,7 +76,7 @@ class Handle(Protocol):
 
     def signal_group(self, signum: int) -> None:
         """Signals it and everything it has started, also once it has gone."""
-        ...
+        signal_group(self.pid, signum)
 
 
 def end_process(handle: Handle, seconds: float) -> None:

@@ -28,36 +28,27 @@ class Outgoing:
 
     def __init__(self, route: Route):
         self.route = route
-        self._unanswered: OrderedDict[str, str] = OrderedDict()
-        """Lineage by message id."""
+        self.unanswered: OrderedDict[str, str] = OrderedDict()
+        """Messages that the consumer has not done with: lineage by id."""
         self._holders: dict[str, int] = {}
         """Which replica holds a part, by id."""
         self._live: set[int] = set()
 
     def has_room(self, lineage: str) -> bool:
         """Whether one more message may be sent: a queue is counted in lineages, so that no join can starve."""
-        if self.route.policy == "latest" or len(self._unanswered) < self.route.queue:
+        if self.route.policy == "latest" or len(self.unanswered) < self.route.queue:
             return True
-        lineages = set(self._unanswered.values())
+        lineages = set(self.unanswered.values())
         return lineage in lineages or len(lineages) < self.route.queue
-
-    @property
-    def unanswered(self) -> int:
-        """Messages that the consumer has not done with."""
-        return len(self._unanswered)
-
-    def oldest(self) -> str:
-        """Id of the message that has waited longest."""
-        return next(iter(self._unanswered), "")
 
     def note(self, message_id: str, lineage: str) -> None:
         """Takes note of a message that is about to be sent."""
         if self.route.policy == "block":
-            self._unanswered[message_id] = lineage
+            self.unanswered[message_id] = lineage
 
     def answered(self, message_id: str) -> None:
         """Lets go of a message that the consumer has done with."""
-        self._unanswered.pop(message_id, None)
+        self.unanswered.pop(message_id, None)
         self._holders.pop(message_id, None)
 
     def appeared(self, replica: int) -> None:
@@ -77,7 +68,7 @@ class Outgoing:
         held = dict.fromkeys(sorted(self._live), 0)
         for holder in self._holders.values():
             held[holder] += 1
-        for message_id in self._unanswered:
+        for message_id in self.unanswered:
             replica = min(held, key=lambda replica: held[replica])
             if held[replica] >= PREFETCH:
                 return
@@ -131,10 +122,6 @@ class Delivery:
         finally:
             self._publish(f"m/{self._stage}/{port}", payload)
         self._deal(edges)
-
-    def unanswered(self) -> dict[str, int]:
-        """Messages that consumers have not done with, by ``stage.port``; waits for nobody."""
-        return {f"{edge.route.consumer}.{edge.route.input}": edge.unanswered for edge in self._edges}
 
     def answered(self, consumer: str, done: Iterable[tuple[str, str]]) -> None:
         """Takes note that a consumer has done with (port, message id) pairs."""
@@ -190,5 +177,5 @@ class Delivery:
             if waited - POLL_SECONDS < PATIENCE_SECONDS <= waited:
                 self._warn(
                     f"held back: {edge.route.consumer}.{edge.route.input} has {edge.route.queue} lineages to answer, "
-                    f"the oldest since {edge.oldest()}"
+                    f"the oldest since {next(iter(edge.unanswered), '')}"
                 )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import subprocess
 import sys
 import threading
 import traceback
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from runner.contract import Refused
-from runner.process.children import DESCENT, ENVIRONMENT, PARENT, Handle, signal_group
+from runner.process.children import DESCENT, ENVIRONMENT, Handle
 
 EXIT_FAILED = 1
 ROOM = 256
@@ -36,21 +35,11 @@ def clean_environment() -> dict[str, str]:
     return {**os.environ, **ENVIRONMENT, DESCENT: room, "PYTHONUNBUFFERED": "1", "PYTHONPATH": paths}
 
 
-def is_clean() -> bool:
-    """True in an interpreter that was started with the variables of a :func:`clean_environment`."""
-    return all(os.environ.get(name) == value for name, value in ENVIRONMENT.items())
-
-
 def become_clean(module: str, *arguments: str) -> None:
     """Starts this process again, as ``python -m module``, unless it was started so."""
-    if not is_clean() or len(os.environ.get(DESCENT, "")) < ROOM:
+    clean = all(os.environ.get(name) == value for name, value in ENVIRONMENT.items())
+    if not clean or len(os.environ.get(DESCENT, "")) < ROOM:
         os.execve(sys.executable, [sys.executable, "-m", module, *arguments], clean_environment())
-
-
-def call_clean(module: str, *arguments: str) -> int:
-    """Runs ``python -m module`` in a clean process, which dies with this one; returns its exit status."""
-    command = [sys.executable, "-m", module, *arguments]
-    return subprocess.call(command, env={**clean_environment(), PARENT: str(os.getpid())})
 
 
 # ------------------------------------------------------------------------------------ one process
@@ -80,10 +69,6 @@ class Forked(Handle):
         """Signals this process alone; one that has gone is no error."""
         if self.poll() is None:
             os.kill(self.pid, signum)
-
-    def signal_group(self, signum: int) -> None:
-        """Signals it and everything it has started, also once it has gone."""
-        signal_group(self.pid, signum)
 
     def kill(self) -> None:
         """Leaves nothing of it behind."""

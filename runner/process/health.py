@@ -1,8 +1,6 @@
 """Signs of life: what every process says of itself twice a second, and when its silence is one too many."""
 
 import contextlib
-import os
-import platform
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -62,8 +60,6 @@ class Heart:
             stage=own.stage,
             replica=own.replica,
             incarnation=own.incarnation,
-            pid=os.getpid(),
-            host=platform.node(),
             cpu_ns=time.process_time_ns(),
             memory_bytes=self._facts.memory_info().rss,
             **self._say(),
@@ -91,9 +87,6 @@ class Watch:
         silent = self._silent
         alive = newest is not self._newest or not (ready or newest)
         self._newest, self._silent = newest, 0.0 if alive else silent + waited
-        return self._change(silent)
-
-    def _change(self, silent: float) -> str:
         before, self.slow = self.slow, self._silent > min(SLOW_SECONDS, self._limits.heartbeat / 2)
         if self.slow and not before:
             left = self._limits.heartbeat - self._silent
@@ -108,7 +101,8 @@ class Watch:
         if not self._ready and self._age > limits.startup:
             return f"start-up hung: not ready after {limits.startup:g} s (startup)"
         if self._silent > limits.heartbeat:
-            return f"hung: no sign of life for {limits.heartbeat:g} s (heartbeat){_within(newest)}"
+            within = f", last in {newest.handler}" if newest is not None and newest.handler else ""
+            return f"hung: no sign of life for {limits.heartbeat:g} s (heartbeat){within}"
         if newest is None:
             return ""
         if newest.state == "working" and newest.handler != SOURCE and newest.busy_ns > limits.timeout * 1e9:
@@ -116,10 +110,6 @@ class Watch:
         if newest.memory_bytes > limits.memory_bytes:
             return f"out of memory: it holds {byte_count(newest.memory_bytes)}, its limit is {limits.memory} (memory)"
         return ""
-
-
-def _within(pulse: Pulse | None) -> str:
-    return f", last in {pulse.handler}" if pulse is not None and pulse.handler else ""
 
 
 def oom_kills() -> int:

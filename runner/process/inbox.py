@@ -5,7 +5,6 @@ import queue
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import cast
 
 import msgspec
@@ -25,21 +24,13 @@ class Mailbox:
         self._queue: queue.SimpleQueue[tuple[str, Packet | None]] = queue.SimpleQueue()
         self._newest: dict[str, Packet] = {}
         self._exchanging = threading.Lock()
-        self._come = dict.fromkeys(node.inputs, 0)
-        """By port."""
-        self._fetched = dict.fromkeys(node.inputs, 0)
-        self.replaced = dict.fromkeys(node.inputs, 0)
-        """Messages that a newer one replaced before they were decoded."""
 
     def put(self, port: str, packet: Packet) -> None:
         """Takes a packet, from any thread."""
         if port not in self._latest:
-            if port in self._come:
-                self._come[port] += 1
             self._queue.put((port, packet))
             return
         with self._exchanging:
-            self.replaced[port] += port in self._newest
             if port not in self._newest:
                 self._queue.put((port, None))
             self._newest[port] = packet
@@ -54,17 +45,14 @@ class Mailbox:
             port, packet = self._queue.get(block=wait)
             while True:
                 if port:
-                    yield port, packet or self._fetch_newest(port)
-                    self._fetched[port] = self._fetched.get(port, 0) + (packet is not None)
+                    with self._exchanging:
+                        fetched = packet or self._newest.pop(port)
+                    yield port, fetched
                 port, packet = self._queue.get_nowait()
 
-    def _fetch_newest(self, port: str) -> Packet:
-        with self._exchanging:
-            return self._newest.pop(port)
-
-    def waiting(self, port: str) -> int:
-        """How many packets of a port wait. May be called from any thread."""
-        return self._come[port] - self._fetched[port] + (port in self._newest)
+    def __len__(self) -> int:
+        """How many packets wait. May be asked from any thread."""
+        return self._queue.qsize()
 
 
 class Parts:
@@ -117,12 +105,8 @@ class Ready(msgspec.Struct, frozen=True):
     arrivals: tuple[Arrival, ...]
 
 
-@dataclass(slots=True)
-class _Lineage:
-    """What has come of one lineage for one handler."""
-
-    waiting: dict[str, deque[Arrival]] = field(default_factory=dict[str, deque[Arrival]])
-    """By port, in order of arrival."""
+_Lineage = dict[str, deque[Arrival]]
+"""What has come of one lineage for one handler: by port, in order of arrival."""
 
 
 class Inbox:
@@ -135,8 +119,6 @@ class Inbox:
         self._ready: deque[Ready] = deque()
         self.waiting = dict.fromkeys(node.inputs, 0)
         """Messages that no step has taken yet, by port; not those that a join keeps for its parts."""
-        self.skipped = dict.fromkeys(node.inputs, 0)
-        """Messages that a newer one replaced, by port, on edges of policy ``latest``."""
         self._used: set[str] = set()
         """Ids of what is kept and has been part of a step."""
         self._unused: list[tuple[str, str]] = []
@@ -147,12 +129,13 @@ class Inbox:
         handler = self._node.type.takers[arrival.port.name]
         if len(handler.inputs) == 1 and arrival.port.kind == "one":
             if self._node.inputs[arrival.port.name].policy == "latest":
-                self._skip_older(handler, arrival.port)
+                self._ready = deque(ready for ready in self._ready if ready.handler is not handler)
+                self.waiting[arrival.port.name] = 0
             self._count(handler, arrival.port, 1)
             self._ready.append(Ready(handler, (arrival,)))
             return
-        lineage = self._lineages[handler.name].setdefault(arrival.envelope.lineage, _Lineage())
-        waiting = lineage.waiting.setdefault(arrival.port.name, deque())
+        lineage = self._lineages[handler.name].setdefault(arrival.envelope.lineage, {})
+        waiting = lineage.setdefault(arrival.port.name, deque())
         if arrival.port.kind == "gather":
             _check_siblings(arrival, waiting)
         waiting.append(arrival)
@@ -192,7 +175,7 @@ class Inbox:
                 yield from self._unused_of(lineage)
 
     def _unused_of(self, lineage: _Lineage) -> Iterator[tuple[str, str]]:
-        for port, arrivals in lineage.waiting.items():
+        for port, arrivals in lineage.items():
             for arrival in arrivals:
                 if arrival.envelope.id in self._used:
                     self._used.discard(arrival.envelope.id)
@@ -204,7 +187,7 @@ class Inbox:
         for handler in self._node.type.handlers:
             for root, lineage in self._lineages[handler.name].items():
                 lacking = [port.name for port in handler.inputs if not _satisfied(port, lineage)]
-                if any(lineage.waiting.get(port.name) for port in handler.inputs if not handler.keeps(port)):
+                if not _only_stays(handler, lineage):
                     yield handler, root, lacking
 
     def _complete(self, handler: Handler, newest: str) -> Iterator[Ready]:
@@ -217,19 +200,13 @@ class Inbox:
             turns.popleft()
 
     def _steps(self, handler: Handler, root: str) -> Iterator[Ready]:
-        lineage = self._lineages[handler.name].get(root, _Lineage())
+        lineage = self._lineages[handler.name].get(root, {})
         while all(_satisfied(port, lineage) for port in handler.inputs):
             arrivals = [arrival for port in handler.inputs for arrival in _take(handler, port, lineage)]
             self._used.update(arrival.envelope.id for arrival in arrivals if handler.keeps(arrival.port))
             yield Ready(handler, tuple(arrivals))
-        if not any(lineage.waiting.values()):
+        if not any(lineage.values()):
             self._lineages[handler.name].pop(root, None)
-
-    def _skip_older(self, handler: Handler, port: InputPort) -> None:
-        newer = deque(ready for ready in self._ready if ready.handler is not handler)
-        skipped, self._ready = len(self._ready) - len(newer), newer
-        self.skipped[port.name] += skipped
-        self._count(handler, port, -skipped)
 
     def _count(self, handler: Handler, port: InputPort, number: int) -> None:
         if not handler.keeps(port):
@@ -254,20 +231,20 @@ def _turn_port(handler: Handler) -> InputPort | None:
 
 
 def _only_stays(handler: Handler, lineage: _Lineage) -> bool:
-    return not any(lineage.waiting.get(port.name) for port in handler.inputs if not handler.keeps(port))
+    return not any(lineage.get(port.name) for port in handler.inputs if not handler.keeps(port))
 
 
 def _satisfied(port: InputPort, lineage: _Lineage) -> bool:
-    waiting = lineage.waiting.get(port.name)
+    waiting = lineage.get(port.name)
     if not waiting:
         return False
     return port.kind == "one" or len(waiting) == cast("Part", waiting[0].message).count
 
 
 def _take(handler: Handler, port: InputPort, lineage: _Lineage) -> list[Arrival]:
-    waiting = lineage.waiting[port.name]
+    waiting = lineage[port.name]
     if port.kind == "gather":
-        lineage.waiting[port.name] = deque()
+        lineage[port.name] = deque()
         return sorted(waiting, key=lambda arrival: cast("Part", arrival.message).index)
     return [waiting[-1]] if handler.keeps(port) else [waiting.popleft()]
 

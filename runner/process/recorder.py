@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import cast
 
 import msgspec
 
@@ -26,7 +26,7 @@ from runner.process.health import Heart
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
 from runner.recording.writer import Manifest, RecordingWriter
-from runner.transport.bus import Bus, Channel
+from runner.transport.bus import Bus
 from runner.transport.presence import Presence
 
 TICK_SECONDS = 0.25
@@ -67,7 +67,7 @@ class Recorder:
         self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
         self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
         self._ended = threading.Event()
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, Callable[[], Iterator[Packet]]] = {}
         """By what is heard; each is taken before those that come before it on a link, and worked on after them."""
         self._changing = threading.Lock()
         self._presence = Presence()
@@ -77,15 +77,16 @@ class Recorder:
         """Their links have closed: all that they have sent has come."""
         self._lost: dict[Process, float] = {}
         """By the supervisor's word: when it is taken that all has come of those that were never seen; 0 once it has."""
-        self._takers = {
-            "m": self._on_message,
-            "s": self._on_step,
-            "l": self._on_log,
-            "x": self._on_lost,
+        reading = self._refusals.reading
+        self._takers: dict[str, Callable[[Packet], None]] = {
+            "m": reading(Envelope, self._on_message),
+            "s": reading(Step, self._on_step),
+            "l": reading(LogLine, lambda line, packet: self._writer.put(line, packet.payload)),
+            "x": reading(Lost, self._on_lost),
             "knows": self._on_knows,
         }
         """By the first part of a key."""
-        self._heart = Heart(own, self._bus, self._vitals)
+        self._heart = Heart(own, self._bus, lambda: {**self._writer.vitals(), "refused": self._refusals.count})
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
@@ -94,7 +95,7 @@ class Recorder:
         self._speaker.start()
         self._taker.start()
         self._heart.start()
-        if self._presence.wait_for(self._manifest.processes, self._must_end):
+        if self._presence.wait_for(self._manifest.processes, lambda: is_orphan() or not self._ends.empty()):
             # Zenoh sends to subscribers in the order in which they came: whoever works on a message has it first.
             self._hear(*sorted({f"m/{topic.partition('/')[0]}/*" for topic in self._manifest.topics}))
             self._bus.announce()
@@ -116,9 +117,6 @@ class Recorder:
         signal handler."""
         self._ends.put(orphaned)
 
-    def _must_end(self) -> bool:
-        return is_orphan() or not self._ends.empty()
-
     def _wait_for_the_end(self) -> bool:
         """Returns whether the supervisor has died. A signal may reach another thread: an endless wait would miss it."""
         while not is_orphan():
@@ -134,9 +132,6 @@ class Recorder:
             time.sleep(TICK_SECONDS / 5)
         self._writer.note_problem("the supervisor died")
 
-    def _vitals(self) -> dict[str, Any]:
-        return {**self._writer.vitals(), "refused": self._refusals.count}
-
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _take_all(self) -> None:
@@ -149,10 +144,9 @@ class Recorder:
         """Takes what is there; what a process has sent that was seen to go is among it."""
         with self._changing:
             gone = [process for process in self._lost if self._has_all_of(process)]
-        heard = [list(channel.take()) for channel in list(self._channels.values())]
+        heard = [list(take()) for take in list(self._channels.values())]
         for packet in itertools.chain(*reversed(heard)):
-            kind, _, rest = packet.key.partition("/")
-            self._takers[kind](rest, packet)
+            self._takers[packet.key.partition("/")[0]](packet)
         for process in gone:
             self._settle(process)
         with self._changing:
@@ -184,44 +178,32 @@ class Recorder:
         self._redelivery.catch_up(process)
         self._say(f"ready/{process.path}", b"")
 
-    def _on_message(self, topic: str, packet: Packet) -> None:
-        envelope = self._refusals.read(Envelope, packet)
-        if envelope is None:
-            return
+    def _on_message(self, envelope: Envelope, packet: Packet) -> None:
+        topic = packet.key.partition("/")[2]
         if not self._manifest.steps_only:
             self._writer.put(envelope, packet.payload)
         for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
             self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
 
-    def _on_step(self, stage: str, packet: Packet) -> None:
+    def _on_step(self, step: Step, packet: Packet) -> None:
         """Refuses what a process says that is dead: the others know it as lost, and do its work again."""
-        step = self._refusals.read(Step, packet)
-        if step is None:
-            return
-        if step.stage != stage:
-            wrong = CodecError("Step", "stage", f"expected {stage}, got {step.stage[:60]!r}")
+        if step.stage != packet.end:
+            wrong = CodecError("Step", "stage", f"expected {packet.end}, got {step.stage[:60]!r}")
             self._refusals.refuse(packet.key, wrong)
         elif self._lost.get(step.process) != 0:
             self._writer.put(step, packet.payload)
             self._redelivery.note_step(step)
             self._to_say.append(step)
 
-    def _on_log(self, _: str, packet: Packet) -> None:
-        line = self._refusals.read(LogLine, packet)
-        if line is not None:
-            self._writer.put(line, packet.payload)
+    def _on_lost(self, lost: Lost, packet: Packet) -> None:
+        self._writer.put(lost, packet.payload)
+        with self._changing:
+            self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
 
-    def _on_lost(self, _: str, packet: Packet) -> None:
-        lost = self._refusals.read(Lost, packet)
-        if lost is not None:
-            self._writer.put(lost, packet.payload)
-            with self._changing:
-                self._lost.setdefault(lost.process, time.monotonic() + UNSEEN_SECONDS)
-
-    def _on_knows(self, path: str, packet: Packet) -> None:
+    def _on_knows(self, packet: Packet) -> None:
         """A publisher sends to a successor from now on; what it has sent before is here."""
         try:
-            publisher, process = Process.of(packet.payload.decode()), Process.of(path)
+            publisher, process = Process.of(packet.payload.decode()), Process.of(packet.key)
         except (Refused, UnicodeDecodeError) as error:
             self._refusals.refuse(packet.key, error)
             return

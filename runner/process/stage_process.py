@@ -95,7 +95,7 @@ class StageProcess:
             task.stage,
             task.routes,
             self._bus.publish,
-            self._warn,
+            partial(self._log, level="warning"),
             stopping=self._stopping.is_set,
             undone=task.undone,
         )
@@ -113,7 +113,7 @@ class StageProcess:
         self._arrived.update(dict.fromkeys(one for one in task.consumed if not self._node.keeps(one[0])))
         self._left: list[tuple[str, str]] = []
         """(port, id) of what was refused since the last step."""
-        self._refusals = Refusals(lambda text: self._log(text, "error"))
+        self._refusals = Refusals(partial(self._log, level="error"))
         self._mailbox = Mailbox(self._node)
         self._catching_up = threading.Lock()
         self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
@@ -169,32 +169,27 @@ class StageProcess:
         """Subscribes to everything first and announces this process last: who sees it may send."""
         own = f"{self._process.stage}/{self._process.replica}"
         for consumer in {self._process.stage, *(route.consumer for route in self._task.routes)}:
-            self._bus.subscribe(f"j/{consumer}", self._on_journal)
+            self._bus.subscribe(f"j/{consumer}", self._refusals.reading(Journal, self._on_journal))
         for port, edge in self._node.inputs.items():
             listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
             listen(f"m/{edge.stage}/{edge.port}", partial(self._on_message, port))
         self._bus.hand_over(f"again/{own}/*", lambda packet: self._arrive(packet.end, packet))
         self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._on_ready())
-        self._bus.hand_over(f"d/{own}/*", self._on_deal)
-        self._bus.hand_over("e/**", self._on_end)
-        self._bus.subscribe("x/*", self._on_lost)
+        self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._on_deal))
+        self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
+        self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
         self._heart.start()
         self._bus.announce()
 
     def _vitals(self) -> dict[str, Any]:
         """What the pulse says beyond what holds for any process. Runs on the pulse's thread and waits for nobody."""
-        record, queued = self._present, self._inbox.waiting
-        working = record is not None and record.computing
+        record = self._present
         return {
-            "state": "waiting" if record is None else "working" if working else "held back",
-            "handler": "" if record is None else record.handler,
-            "busy_ns": 0 if record is None else record.busy_ns,
+            **(record.vitals() if record is not None else {}),
             "steps": self._steps,
             "refused": self._refusals.count,
-            "queued": {port: waiting + self._mailbox.waiting(port) for port, waiting in queued.items()},
-            "skipped": self._skipped(),
-            "unanswered": self._delivery.unanswered(),
+            "queued": {**self._inbox.waiting, "mailbox": len(self._mailbox)},
             "sent": dict(self._sent),
         }
 
@@ -209,23 +204,13 @@ class StageProcess:
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
 
-    def _on_lost(self, packet: Packet) -> None:
-        lost = self._refusals.read(Lost, packet)
-        if lost is not None:
-            self._presence.ended(lost.process)
-            self._delivery.lost(lost.process)
+    def _on_lost(self, lost: Lost, _: Packet) -> None:
+        self._presence.ended(lost.process)
+        self._delivery.lost(lost.process)
 
-    def _on_end(self, packet: Packet) -> None:
-        try:
-            self._presence.ended(Process.of(packet.key))
-        except Refused as refusal:
-            self._refusals.refuse(packet.key, refusal)
-
-    def _on_journal(self, packet: Packet) -> None:
+    def _on_journal(self, journal: Journal, packet: Packet) -> None:
         """What a step has done with is acknowledged by it, once the recorder has the step."""
-        journal, consumer = self._refusals.read(Journal, packet), packet.end
-        if journal is None:
-            return
+        consumer = packet.end
         for done in (journal.answered, *map(answered, journal.steps)):
             self._delivery.answered(consumer, done)
             if consumer == self._process.stage:
@@ -261,9 +246,8 @@ class StageProcess:
                 return
         self._mailbox.put(port, packet)
 
-    def _on_deal(self, packet: Packet) -> None:
-        deal = self._refusals.read(Deal, packet)
-        if deal is not None and (part := self._parts.deal(packet.end, deal.id)) is not None:
+    def _on_deal(self, deal: Deal, packet: Packet) -> None:
+        if (part := self._parts.deal(packet.end, deal.id)) is not None:
             self._mailbox.put(packet.end, part)
 
     def _take(self, name: str, packet: Packet) -> None:
@@ -407,15 +391,6 @@ class StageProcess:
         """Records what was never worked on."""
         for handler, lineage, lacking in self._inbox.incomplete():
             self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-        for port, skipped in self._skipped().items():
-            if skipped:
-                self._log(f"{port}: {skipped} messages were replaced by newer ones before they were read", "debug")
-
-    def _skipped(self) -> dict[str, int]:
-        return {port: skipped + self._mailbox.replaced[port] for port, skipped in self._inbox.skipped.items()}
-
-    def _warn(self, text: str) -> None:
-        self._log(text, "warning")
 
     def _log(self, text: str, level: Level) -> None:
         line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
@@ -438,21 +413,14 @@ class _Record:
         self.outcome: Outcome = "done"
         self.error = ""
 
-    @property
-    def handler(self) -> str:
-        """What runs."""
-        return self._ready.handler.name
-
-    @property
-    def computing(self) -> bool:
-        """Whether the handler runs, rather than what it emitted being sent."""
-        return self._begun_ns > 0
-
-    @property
-    def busy_ns(self) -> int:
-        """Time inside the handler so far. May be read from any thread."""
-        begun = self._begun_ns
-        return self._computed_ns + (time.monotonic_ns() - begun if begun else 0)
+    def vitals(self) -> dict[str, Any]:
+        """What the pulse says of it. May be asked from any thread."""
+        computed, begun = self._computed_ns, self._begun_ns
+        return {
+            "state": "working" if begun else "held back",
+            "handler": self._ready.handler.name,
+            "busy_ns": computed + (time.monotonic_ns() - begun if begun else 0),
+        }
 
     def timed(self, emissions: Iterator[Draft | None]) -> Iterator[Draft]:
         """Passes emissions on up to a None, noting their ids and the time the handler took for them."""
@@ -464,7 +432,8 @@ class _Record:
                 self.ended = True
                 return
             finally:
-                self._computed_ns, self._begun_ns = self.busy_ns, 0
+                begun, self._begun_ns = self._begun_ns, 0
+                self._computed_ns += time.monotonic_ns() - begun
             if draft is None:
                 return
             self.emitted.append(draft.envelope.id)
@@ -513,36 +482,22 @@ def main() -> int:
     sys.setswitchinterval(SWITCH_SECONDS)
     for signum in (signal.SIGINT, signal.SIGHUP):
         signal.signal(signum, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # there is nothing to finish before the stage is there
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
+    process, code = None, 0
     try:
         process = StageProcess(assignment)
-    except Refused as refusal:
-        return _fail(str(refusal), EXIT_REFUSED)
-    except Exception as error:
-        traceback.print_exc()
-        return _fail(_summary(error), EXIT_FAILED)
-    signal.signal(signal.SIGTERM, lambda *_: process.stop())
-    signal.signal(signal.SIGUSR1, lambda *_: process.retire())
-    return _serve(process)
-
-
-def _serve(process: StageProcess) -> int:
-    code = 0
-    try:
+        signal.signal(signal.SIGTERM, lambda *_: process.stop())
+        signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
     except Refused as refusal:
         code = _fail(str(refusal), EXIT_REFUSED)
     except BaseException as error:
         traceback.print_exc()
         code = _fail(_summary(error), EXIT_FAILED)
-    process.close(failed=code != 0)
+    if process is not None:
+        process.close(failed=code != 0)
     return code
-
-
-def _leave(*_: object) -> None:
-    """Before the stage is there, there is nothing to finish."""
-    os._exit(0)
 
 
 def _fail(reason: str, code: int) -> int:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -47,22 +47,15 @@ class StepContext:
     def __init__(self, *, time_ns: int, seed: Callable[[], int], directory: Path, log: Log):
         """``seed`` is asked when random numbers are wanted."""
         self.time_ns = time_ns
+        self.directory = directory
+        """Folder beside the recording."""
         self._seed = seed
-        self._rng: np.random.Generator | None = None
-        self._directory = directory
         self._log = log
 
-    @property
+    @cached_property
     def rng(self) -> np.random.Generator:
         """Random numbers of this step, made when they are first asked for."""
-        if self._rng is None:
-            self._rng = np.random.default_rng(self._seed())
-        return self._rng
-
-    @property
-    def directory(self) -> Path:
-        """Folder beside the recording."""
-        return self._directory
+        return np.random.default_rng(self._seed())
 
     def log(self, text: str, *, level: Level = "info") -> None:
         """Shows and records one line."""

@@ -165,9 +165,13 @@ def new_file(path: Path) -> Generator[IO[bytes]]:
             part.unlink()
 
 
+def recordings_in(folder: Path) -> list[Path]:
+    """Recordings, the one that was written last first."""
+    return sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
+
+
 def _beside(folder: Path) -> str:
-    found = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-    return f"recordings in {folder}: {', '.join(path.name for path in found[:8]) or 'none'}"
+    return f"recordings in {folder}: {', '.join(path.name for path in recordings_in(folder)[:8]) or 'none'}"
 
 
 class Growing:

@@ -41,9 +41,9 @@ def package_versions() -> dict[str, str]:
     return {found.name: found.version for found in sorted(distributions(), key=lambda found: found.name.lower())}
 
 
-def changed_packages(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
-    """Each package whose version differs."""
-    for name in sorted({*then, *now}, key=str.lower):
+def changes(then: Mapping[str, str], now: Mapping[str, str], names: Iterable[str]) -> Iterator[str]:
+    """What of these names, for example of packages with their versions, is not as it was."""
+    for name in names:
         if then.get(name) != now.get(name):
             yield f"{name} {then.get(name, 'absent')} -> {now.get(name, 'absent')}"
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -13,10 +12,10 @@ from typing import Any, TypeVar
 import msgspec
 from mcap.records import Metadata
 
-from runner.contract import Refused
-from runner.graph.graph import SUPERVISOR
-from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, unpack
-from runner.message.ids import IdText
+from runner.contract import Message, Refused
+from runner.graph.graph import SUPERVISOR, Graph
+from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open_envelope, unpack
+from runner.message.ids import IdText, MessageId
 from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short
@@ -96,6 +95,21 @@ def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(name for name, stage in graph["stages"].items() if stage.get("replicas", 1) != 1)
 
 
+def kind_of(graph: Graph, id: str) -> type[Message] | None:
+    """The class of a message; None where the graph has no such output."""
+    one = MessageId.of(id)
+    return graph.outputs_of(one.stage).get(one.port)
+
+
+def opened(graph: Graph, sealed: Envelope) -> Message | None:
+    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
+    kind = kind_of(graph, sealed.id)
+    try:
+        return open_envelope(kind, sealed) if kind else None
+    except CodecError as error:
+        raise Refused(f"{sealed.id} cannot be read: {error}") from None
+
+
 def _decoded(text: str, kind: type[T]) -> T:
     """What a JSON text holds; nothing (``kind()``) where it is none or of another type."""
     try:
@@ -125,7 +139,7 @@ class Recording:
         self.log: list[LogLine] = []
         self.lost: list[Lost] = []
         """Processes that died."""
-        self.repeated: Counter[str] = Counter()
+        self.repeated: set[str] = set()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
         self._open = lru_cache(OPEN_CHUNKS)(self._envelopes_at)
         self._order: list[tuple[str, int, Record]] = []
@@ -138,13 +152,19 @@ class Recording:
                 file.seek(0)
                 self._forget()
                 self._read(Container(file, str(path), self.container))
-        self.graph = self._read_graph()
-        """The graph as it ran, with all settings applied."""
-
-    @property
-    def run(self) -> dict[str, str]:
+        self.damage, self.torn = self.container.damage, self.container.torn
+        """Places that do not hold what was written there, as ``byte 4711: reason``; whether the end is missing."""
+        if RUN not in self.metadata:
+            damaged = f" ({self.damage[0]})" if self.damage else ""
+            raise Refused(f"{path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
+        self.run = self.metadata[RUN]
         """What ran where: graph, settings, seed, versions, revision, fingerprint."""
-        return self.metadata[RUN]
+        self.graph = self.aspect("graph", dict[str, Any]())
+        """The graph as it ran, with all settings applied."""
+        try:
+            Proof(self.graph)
+        except msgspec.ValidationError as error:
+            raise Refused(f"{path}: the {RUN!r} metadata holds no readable graph: {error}") from None
 
     @property
     def fingerprint(self) -> str:
@@ -155,16 +175,6 @@ class Recording:
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
         return _decoded(self.run.get(name, ""), type(default)) or default
-
-    @property
-    def damage(self) -> list[str]:
-        """Places that do not hold what was written there, as ``byte 4711: reason``."""
-        return self.container.damage
-
-    @property
-    def torn(self) -> bool:
-        """True where the end of the file is missing."""
-        return self.container.torn
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -217,7 +227,7 @@ class Recording:
             try:
                 self._enter_entry(record)
             except CodecError as error:
-                self.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
+                container.damage.append(f"byte {record.offset}: a record of {record.topic}: {error}")
 
     def _enter_metadata(self, record: Metadata) -> None:
         if record.name in self.metadata:
@@ -238,7 +248,8 @@ class Recording:
             case Lost():
                 self.lost.append(record)
             case Envelope(id=id):
-                self.repeated[id] += id in self.messages
+                if id in self.messages:
+                    self.repeated.add(id)
                 located = Located(id, record.lineage, entry.topic, record.type, time_ns, len(data), entry.offset)
                 self.messages.setdefault(id, located)
         if VERDICT in self.metadata:
@@ -284,14 +295,3 @@ class Recording:
         for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof
-
-    def _read_graph(self) -> dict[str, Any]:
-        if RUN not in self.metadata:
-            damaged = f" ({self.damage[0]})" if self.damage else ""
-            raise Refused(f"{self.path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
-        graph = self.aspect("graph", dict[str, Any]())
-        try:
-            Proof(graph)
-        except msgspec.ValidationError as error:
-            raise Refused(f"{self.path}: the {RUN!r} metadata holds no readable graph: {error}") from None
-        return graph

@@ -138,7 +138,7 @@ class RecordingWriter:
         self._proof = Proof(json.loads(manifest.graph))
         self._proving = threading.Lock()
         self._file = _create(self._path)
-        self._index_file = _unnamed_file(self._path.parent)
+        self._index_file = tempfile.TemporaryFile(buffering=0, dir=self._path.parent)  # noqa: SIM115 - see _write_all
         self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
         vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndex(self._index_file)
         self._writer.start(profile=PROFILE)
@@ -383,10 +383,6 @@ def _create(path: Path) -> IO[bytes]:
         raise Refused(f"recording {path}: cannot be created: {error.strerror}") from None
     hold(file)
     return file
-
-
-def _unnamed_file(folder: Path) -> IO[bytes]:
-    return tempfile.TemporaryFile(buffering=0, dir=folder)
 
 
 _SCHEMAS: Mapping[str, dict[str, Any]] = {kind.__name__: msgspec.json.schema(kind) for kind in (Step, LogLine, Lost)}

@@ -7,7 +7,6 @@ lived, runs in a fresh process of its own.
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 import time
 from collections import Counter
@@ -70,8 +69,8 @@ def plan(path: Path) -> list[str]:
     return [f"{path}: {recording.verdict}", *table(("stage", "in a replay", "steps", "computed"), rows)]
 
 
-def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> int:
-    """Executes everything again in ``workers`` processes at a time (None: one a core) and compares every byte.
+def verify(path: Path, assignments: Sequence[str], *, workers: int) -> int:
+    """Executes everything again in ``workers`` processes at a time and compares every byte.
 
     Prints what comes of it. Returns 0 where every message is identical, or where this machine is another and every
     message within the graph's tolerances; else 1. Raises Refused where the file is no recording.
@@ -88,7 +87,7 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> in
         if not same:
             tolerances = load_tolerances(graph.tolerances, f"tolerances of graph {graph.name!r}")
     results: dict[Task, Result] = {}
-    for task, result in _Verification(recording, values, tolerances).results(workers or len(os.sched_getaffinity(0))):
+    for task, result in _results(recording, values, tolerances, workers):
         print(f"{task}: {result}")
         results[task] = result
     found = Summary(change for result in results.values() for change in result.changes)
@@ -97,48 +96,46 @@ def verify(path: Path, assignments: Sequence[str], *, workers: int | None) -> in
     return code
 
 
-class _Verification:
-    """One replay of everything."""
+def _results(
+    recording: Recording, graph: dict[str, Any], tolerances: Tolerances, workers: int
+) -> Iterator[tuple[Task, Result]]:
+    """Executes every task in a process of its own and says how each ended.
 
-    def __init__(self, recording: Recording, graph: dict[str, Any], tolerances: Tolerances) -> None:
-        self._recording = recording
-        self._graph = graph
-        self._tolerances = tolerances
+    Longest stages come first, so that the workers end together; each is imported when it is drawn.
+    """
+    with tempfile.TemporaryDirectory() as folder:
 
-    def results(self, workers: int) -> Iterator[tuple[Task, Result]]:
-        """Executes every task and says how each ended."""
-        with tempfile.TemporaryDirectory() as folder:
-            jobs = self._jobs(workers, Path(folder))
-            for task, answer in run_each(jobs, workers=workers, folder=Path(folder)):
-                failed = isinstance(answer, str)
-                yield task, Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
+        def jobs() -> Iterator[tuple[Task, Callable[[], bytes]]]:
+            for stage in _by_cost(recording):
+                node = node_from_entry(stage, graph["stages"][stage])
+                if not node.type.cls.device:
+                    node.prepare()
+                    execute = partial(
+                        _execute, recording, node, seed=graph["seed"], tolerances=tolerances, folder=folder
+                    )
+                    yield from ((task, partial(execute, task)) for task in tasks_of(recording, node, workers))
 
-    def _jobs(self, workers: int, folder: Path) -> Iterator[tuple[Task, Callable[[], bytes]]]:
-        """Every task, longest stages first, so that the workers end together; each is imported when it is drawn."""
-        for stage in _by_cost(self._recording):
-            node = node_from_entry(stage, self._graph["stages"][stage])
-            if not node.type.cls.device:
-                node.prepare()
-                for task in tasks_of(self._recording, node, workers):
-                    yield task, partial(self._work, node, task, folder)
+        for task, answer in run_each(jobs(), workers=workers, folder=Path(folder)):
+            failed = isinstance(answer, str)
+            yield task, Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
 
-    def _work(self, node: Node, task: Task, folder: Path) -> bytes:
-        """Executes one task; runs in the task's own process."""
-        try:
-            return msgspec.json.encode(self._result(node, task, folder))
-        except Refused as refusal:
-            return msgspec.json.encode(Result(failure=str(refusal)))
 
-    def _result(self, node: Node, task: Task, folder: Path) -> Result:
-        began = time.process_time()
-        steps, files = steps_of(self._recording, task, node), Path(tempfile.mkdtemp(dir=folder))
-        again = Reexecution(self._recording, node, steps, seed=self._graph["seed"], directory=files)
-        startup = time.process_time() - began
-        comparison = Comparison(self._recording, node, self._tolerances)
+def _execute(recording: Recording, node: Node, task: Task, *, seed: int, tolerances: Tolerances, folder: str) -> bytes:
+    """Executes one task; runs in the task's own process."""
+    began = time.process_time()
+    steps, files = steps_of(recording, task, node), Path(tempfile.mkdtemp(dir=folder))
+    comparison = Comparison(recording, node, tolerances)
+    try:
+        again = Reexecution(recording, node, steps, seed=seed, directory=files)
+        comparison.result.startup = time.process_time() - began
         for step in steps:
             comparison.add(again.execute(step))
         again.stage.close()
-        return comparison.result(again.seconds, startup)
+        comparison.result.seconds = again.seconds
+        comparison.result.changes = tuple(comparison.summary.changes)
+    except Refused as refusal:
+        return msgspec.json.encode(Result(failure=str(refusal)))
+    return msgspec.json.encode(comparison.result)
 
 
 def _cost(recording: Recording, results: Mapping[Task, Result], wall: float) -> str:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Message, Refused, Tolerances
-from runner.graph.graph import SUPERVISOR, Graph, Node
+from runner.contract import Tolerances
+from runner.graph.graph import Node
 from runner.graph.ports import Handler
 from runner.inspect.compare import envelope_differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, open_envelope, pack
+from runner.message.codec import CodecError, Envelope, Step, pack
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
@@ -41,8 +41,8 @@ class Task(msgspec.Struct, frozen=True):
         return f"{self.stage}{_after_restart(self.incarnation)}{share}"
 
 
-class Result(msgspec.Struct, frozen=True):
-    """How a task ended."""
+class Result(msgspec.Struct):
+    """How a task ended, or how far it has come."""
 
     steps: int = 0
     messages: int = 0
@@ -181,64 +181,51 @@ class Comparison:
 
     def __init__(self, recording: Recording, node: Node, tolerances: Tolerances) -> None:
         """``tolerances`` is empty where the fingerprint is the recording's."""
+        self.result = Result()
         self._recording = recording
         self._node = node
         self._tolerances = tolerances
         self._positions = {id: position for position, id in enumerate(recording.messages)}
-        self._summary = Summary()
-        self._found: list[tuple[int, str]] = []
-        self._steps = self._messages = self._within = 0
+        self.summary = Summary()
 
     def add(self, done: Execution) -> None:
         """Compares one step."""
-        self._steps += 1
-        self._found += self._differences(done)
-
-    def result(self, seconds: float, startup: float) -> Result:
-        """What all steps came to."""
-        first = min(self._found, key=itemgetter(0), default=None)
-        changes = tuple(self._summary.changes)
-        found = len(self._found)
-        return Result(self._steps, self._messages, seconds, startup, self._within, found, first, changes)
-
-    def _differences(self, done: Execution) -> Iterator[tuple[int, str]]:
         step = done.step
+        self.result.steps += 1
         if done.refused:
-            yield self._divergence(step, step.emitted[0] if step.emitted else step.handler, done.refused)
+            self._diverge(step, step.emitted[0] if step.emitted else step.handler, done.refused)
             return
         for id, sealed in itertools.zip_longest(step.emitted, done.emitted):
             if id is None:
-                yield self._divergence(step, sealed.id, "emitted in the replay only")
+                self._diverge(step, sealed.id, "emitted in the replay only")
             elif sealed is None:
-                yield self._divergence(step, id, "recorded, and not emitted in the replay")
+                self._diverge(step, id, "recorded, and not emitted in the replay")
             elif id in self._recording.messages:
-                text = self._compare(id, sealed)
-                if text:
-                    yield self._divergence(step, id, text)
+                self._compare(step, self._recording.envelope(id), sealed)
         if step.outcome != "stopped" and not (step.error.startswith(done.error) if done.error else not step.error):
             text = f"recorded {step.error or 'no error'!r}, replayed {done.error or 'no error'!r}"
-            yield self._divergence(step, "-", f"error: {text}")
+            self._diverge(step, "-", f"error: {text}")
 
-    def _compare(self, id: str, replayed: Envelope) -> str:
-        """Where two messages differ by more than is allowed, or nothing."""
-        self._messages += 1
-        recorded = self._recording.envelope(id)
+    def _compare(self, step: Step, recorded: Envelope, replayed: Envelope) -> None:
+        self.result.messages += 1
         other = what_differs(recorded, replayed)
         if other is None:
-            return ""
-        kind = self._node.type.outputs.get(MessageId.of(id).port)
-        found = list(envelope_differences(recorded, other, HEADER, kind))
-        self._summary.add(MessageId.of(id).topic, id, found)
+            return
+        id = MessageId.of(recorded.id)
+        found = list(envelope_differences(recorded, other, HEADER, self._node.type.outputs.get(id.port)))
+        self.summary.add(id.topic, recorded.id, found)
         beyond = next(outside(found, self._tolerances), None)
         if beyond is None and found and self._tolerances:
-            self._within += 1
-            return ""
-        return str(beyond or "the same values in other bytes")
+            self.result.within += 1
+        else:
+            self._diverge(step, recorded.id, str(beyond or "the same values in other bytes"))
 
-    def _divergence(self, step: Step, message: str, difference: str) -> tuple[int, str]:
+    def _diverge(self, step: Step, message: str, difference: str) -> None:
         """``message`` is an id, or what was expected in its place."""
         position = self._positions.get(message, len(self._positions))
-        return position, f"stage {process_of(step)}, step {step.number}, message {message}: {difference}"
+        found = position, f"stage {process_of(step)}, step {step.number}, message {message}: {difference}"
+        self.result.diverged += 1
+        self.result.first = min(self.result.first or found, found, key=itemgetter(0))
 
 
 def process_of(step: Step) -> str:
@@ -256,19 +243,3 @@ def what_differs(recorded: Envelope, replayed: Envelope) -> Envelope | None:
         return None
     replayed = without_gained_fields(recorded, replayed)
     return None if pack(recorded) == pack(replayed) else replayed
-
-
-def kind_of(graph: Graph, id: str) -> type[Message] | None:
-    """The class of a message; None where the graph has no such output."""
-    one = MessageId.of(id)
-    known = one.stage in graph.nodes or one.stage == SUPERVISOR
-    return graph.outputs_of(one.stage).get(one.port) if known else None
-
-
-def opened(graph: Graph, sealed: Envelope) -> Message | None:
-    """The message inside; None where the graph has no such output. Raises Refused where it cannot be read."""
-    kind = kind_of(graph, sealed.id)
-    try:
-        return open_envelope(kind, sealed) if kind else None
-    except CodecError as error:
-        raise Refused(f"{sealed.id} cannot be read: {error}") from None

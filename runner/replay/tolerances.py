@@ -3,41 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 
 from runner.contract import Tolerance, Tolerances
 from runner.inspect.compare import Difference
-from runner.recording.provenance import fingerprint, machine, numerical, package_versions, revision, runner_version
+from runner.recording import provenance
 from runner.recording.recording import Recording
-
-UNKNOWN = "absent"
 
 
 def compare_origin(recording: Recording) -> tuple[bool, list[str]]:
     """Whether floats must come out equal to the last bit, and what has changed since the recording, as lines."""
-    packages, here, names = package_versions(), machine(), numerical(recording.graph)
+    changes = provenance.changes
+    packages, here, names = provenance.package_versions(), provenance.machine(), provenance.numerical(recording.graph)
     then = recording.aspect("packages", dict[str, str]())
     # An aspect that an older runner did not record cannot be said to have changed.
     before = {**here, **recording.aspect("machine", dict[str, str]())}
-    same = fingerprint(before, then, names) == fingerprint(here, packages, names)
+    same = provenance.fingerprint(before, then, names) == provenance.fingerprint(here, packages, names)
     lines: list[str] = []
     if not same:
-        computing = list(_changes({name: then.get(name, UNKNOWN) for name in names}, packages))
-        computing += [change for change in _changes(before, here) if not change.startswith("system ")]
+        computing = [
+            *changes(then, packages, names),
+            *changes(before, here, [aspect for aspect in before if aspect != "system"]),
+        ]
         lines.append(f"FINGERPRINT DIFFERS: {'; '.join(computing)}: tolerances apply where a graph has them")
-    others = {name: version for name, version in then.items() if name not in names}
+    others = (name for name in then if name not in names)
     source = {"source": recording.run.get("revision") or "unknown"}
     runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
-    now = {"source": revision(recording.graph) or "unknown", "runner": runner_version()}
-    if other := [*_changes(others, packages), *_changes({**source, **runner}, now)]:
+    now = {"source": provenance.revision(recording.graph) or "unknown", "runner": provenance.runner_version()}
+    if other := [*changes(then, packages, others), *changes({**source, **runner}, now, [*source, *runner])]:
         lines.append(f"changed since the recording: {'; '.join(other)}")
     return same, lines
-
-
-def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
-    for name, value in then.items():
-        if now.get(name, UNKNOWN) != value:
-            yield f"{name} {value} -> {now.get(name, UNKNOWN)}"
 
 
 def outside(differences: Iterable[Difference], tolerances: Tolerances) -> Iterator[Difference]:

@@ -7,9 +7,8 @@ import importlib
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +24,11 @@ from runner.inspect.echo import array_text
 from runner.inspect.info import table
 from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
-from runner.process.step import Arrival, arguments_of
-from runner.recording.recording import Recording, replicated
+from runner.process.step import arguments_of
+from runner.recording.recording import Recording, kind_of, opened, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
-from runner.replay.tasks import (
-    HEADER,
-    Execution,
-    Reexecution,
-    Task,
-    kind_of,
-    opened,
-    process_of,
-    steps_of,
-    what_differs,
-)
+from runner.replay.tasks import HEADER, Execution, Reexecution, Task, process_of, steps_of, what_differs
 
 SHOWN = 76
 """Characters of a value that are shown."""
@@ -112,19 +101,6 @@ def first_match(recording: Recording, graph: Graph, condition: str) -> str | Non
     return None
 
 
-@dataclass(slots=True)
-class Moment:
-    """What there is to see at one message."""
-
-    id: str
-    message: Message | None
-    stage: Stage | None
-    """None for devices, which are not executed."""
-    step: Step | None
-    arrivals: list[Arrival]
-    notes: list[str]
-
-
 class Traveller:
     """Goes from message to message; stages are constructed when the first of their messages is reached."""
 
@@ -141,27 +117,31 @@ class Traveller:
         """Shows a message, with ``step`` the ones after it too for as long as somebody presses Enter."""
         ids = list(self._recording.messages)
         for id in ids[ids.index(start) :]:
-            moment = self.moment(id)
-            print("\n".join(described(moment, self._recording)), flush=True)
+            names, notes = self._reach(id)
+            print("\n".join(self._described(id, names["message"], notes)), flush=True)
             if prompt:
-                self._prompt(moment)
-            if not step or not self._goes_on(moment):
+                _prompt(names)
+            if not step or not _goes_on(names):
                 return
             prompt = False
 
-    def moment(self, id: str) -> Moment:
-        """Executes the stage that emitted a message up to it."""
+    def _reach(self, id: str) -> tuple[dict[str, Any], list[str]]:
+        """Executes the stage that emitted a message up to it: what there is to look at, and what came of it.
+
+        Of devices, which are not executed, there is no stage.
+        """
         step, recorded = self._causes.step_of(id), self._recording.envelope(id)
         node = self._graph.nodes.get(MessageId.of(id).stage)
+        names: dict[str, Any] = {"stage": None, "message": None, "arrivals": {}, "recording": self._recording}
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
-            return Moment(id, opened(self._graph, recorded), None, step, [], [why])
-        stage, executions = self._process_of(step)
+            return {**names, "message": opened(self._graph, recorded)}, [why]
+        names["stage"], executions = self._process_of(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
+        names["arrivals"] = arguments_of(execution.arrivals)
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
-        message = opened(self._graph, sealed) if sealed else None
-        notes = [*self._notes(execution, recorded, sealed), *self._log]
-        return Moment(id, message, stage, step, execution.arrivals, notes)
+        names["message"] = opened(self._graph, sealed) if sealed else None
+        return names, [*self._notes(execution, recorded, sealed), *self._log]
 
     def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
         """The process that took a step, as far as it has been executed again."""
@@ -200,53 +180,45 @@ class Traveller:
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]
 
-    def _prompt(self, moment: Moment) -> None:
-        """A Python prompt; its end goes on."""
-        names: dict[str, Any] = {
-            "stage": moment.stage,
-            "message": moment.message,
-            "arrivals": arguments_of(moment.arrivals),
-            "recording": self._recording,
-        }
-        with suppress(ImportError):
-            importlib.import_module("readline")  # line editing for people
-        with suppress(SystemExit):
-            code.interact(f"{', '.join(names)} are here; Ctrl-D goes on", local=names, exitmsg="")
+    def _described(self, id: str, message: Message | None, notes: Iterable[str]) -> Iterator[str]:
+        """A message, what became of it, and its causes, as lines."""
+        step, sealed = self._causes.step_of(id), self._recording.envelope(id)
+        yield f"{id}  {sealed.type}, of {sealed.lineage}"
+        if step is not None:
+            yield f"  step {step.number} of {process_of(step)}, {step.handler}"
+        yield from (f"  {note}" for note in notes)
+        fields = message.__struct_fields__ if message is not None else ()
+        yield from (f"    {name} = {brief(getattr(message, name))}" for name in fields)
+        if step is not None and step.consumed:
+            yield f"  causes (the whole tree: runner why {id} {self._recording.path})"
+            known = self._recording.messages
+            rows = [(port, id, known[id].type if id in known else "not recorded") for port, id in step.consumed]
+            yield from (f"    {line}" for line in table(("port", "id", "type"), rows)[1:])
 
-    def _goes_on(self, moment: Moment) -> bool:
-        while True:
-            try:
-                answer = input(PROMPT).strip()
-            except EOFError:
-                return False
-            if answer != "p":
-                return answer != "q"
-            self._prompt(moment)
+
+def _prompt(names: dict[str, Any]) -> None:
+    """A Python prompt; its end goes on."""
+    with suppress(ImportError):
+        importlib.import_module("readline")  # line editing for people
+    with suppress(SystemExit):
+        code.interact(f"{', '.join(names)} are here; Ctrl-D goes on", local=dict(names), exitmsg="")
+
+
+def _goes_on(names: dict[str, Any]) -> bool:
+    while True:
+        try:
+            answer = input(PROMPT).strip()
+        except EOFError:
+            return False
+        if answer != "p":
+            return answer != "q"
+        _prompt(names)
 
 
 def _reached(done: Execution, step: Step, id: str) -> bool:
     """True at the message, and at the end of its step where the message did not come."""
     at_message = bool(done.emitted) and done.emitted[-1].id == id
     return at_message or (done.step is step and done.ended)
-
-
-# ------------------------------------------------------------------------------------ for people
-
-
-def described(moment: Moment, recording: Recording) -> Iterator[str]:
-    """A message, what became of it, and its causes, as lines."""
-    sealed = recording.envelope(moment.id)
-    yield f"{moment.id}  {sealed.type}, of {sealed.lineage}"
-    if moment.step is not None:
-        yield f"  step {moment.step.number} of {process_of(moment.step)}, {moment.step.handler}"
-    yield from (f"  {note}" for note in moment.notes)
-    fields = moment.message.__struct_fields__ if moment.message is not None else ()
-    yield from (f"    {name} = {brief(getattr(moment.message, name))}" for name in fields)
-    if moment.step is not None and moment.step.consumed:
-        yield f"  causes (the whole tree: runner why {moment.id} {recording.path})"
-        known = recording.messages
-        rows = [(port, id, known[id].type if id in known else "not recorded") for port, id in moment.step.consumed]
-        yield from (f"    {line}" for line in table(("port", "id", "type"), rows)[1:])
 
 
 def brief(value: Any) -> str:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 from runner.contract import Message, Refused, Scorer
 from runner.graph.document import suggest
 from runner.graph.graph import Graph, node_entry
-from runner.graph.references import load_class
 from runner.inspect.compare import envelope_differences
 from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import Envelope
 from runner.message.ids import MessageId
-from runner.recording.recording import Recording
+from runner.recording.recording import Recording, kind_of, opened
 from runner.replay.partial import PartialReplay
 from runner.replay.replay import change
-from runner.replay.tasks import HEADER, kind_of, opened, what_differs
+from runner.replay.tasks import HEADER, what_differs
 from runner.replay.tolerances import compare_origin
 from runner.terminal import listed
 
@@ -37,7 +35,7 @@ def what_if(
     assignments: Sequence[str],
     swaps: Sequence[str],
     origins: Sequence[str],
-    workers: int | None,
+    workers: int,
 ) -> int:
     """Executes what follows from a change again and prints what it changes.
 
@@ -53,7 +51,6 @@ def what_if(
     what = f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
     print(*changes, f"{path}: {recording.verdict}", what, sep="\n")
     with tempfile.TemporaryDirectory() as folder:
-        workers = workers or len(os.sched_getaffinity(0))
         replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
         replay.run()
     for line in _verdict(recording, graph, names, replay):
@@ -167,8 +164,7 @@ def _scores(recording: Recording, graph: Graph, names: Collection[str], replay: 
     if graph.score is None:
         yield "no score: the graph names none; valid: --set score=module:Class"
         return
-    cls = load_class(graph.score, f"score of graph {graph.name!r}")
-    scorer = cast("Scorer", cls({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
+    scorer: Scorer = graph.load("score", graph.score)
     before = scorer.score(_messages(change(recording), recording.envelopes()))
     now = scorer.score(_messages(graph, _new_run(recording, names, replay)))
     rows = [_score_row(name, before.get(name), now.get(name)) for name in {**before, **now}]

@@ -14,9 +14,6 @@ from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, oom_kills
 
-RESENT = 1000
-"""Those that a successor is told."""
-
 
 @dataclass(slots=True)
 class Child:
@@ -73,21 +70,13 @@ class Progress:
         self.undone: dict[tuple[str, str, str], None] = {}
         """(consumer, port, id) of parts that were sent and not done with."""
         self._shared = [route for route in routes if route.shared]
-        self._consumed = Recent[tuple[str, str], None]()
-
-    @property
-    def newest_consumed(self) -> tuple[tuple[str, str], ...]:
-        """(port, id) of what may come once more."""
-        return tuple(self._consumed)[-RESENT:]
-
-    def has_done(self, port: str, id: str) -> bool:
-        """Whether the stage has done with a message lately."""
-        return (port, id) in self._consumed
+        self.consumed = Recent[tuple[str, str], None]()
+        """(port, id) of what the stage has done with lately."""
 
     def note(self, step: Step, consumers: Mapping[str, "Progress"]) -> None:
         """Takes a step that the recorder has; only what was done counts."""
         for key in answered(step):
-            self._consumed[key] = None
+            self.consumed[key] = None
         if step.outcome != "done":
             return
         self.started |= not step.consumed
@@ -95,5 +84,5 @@ class Progress:
             one = MessageId.of(id)
             self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
             for route in self._shared:
-                if route.output == one.port and not consumers[route.consumer].has_done(route.input, id):
+                if route.output == one.port and (route.input, id) not in consumers[route.consumer].consumed:
                     self.undone[route.consumer, route.input, id] = None

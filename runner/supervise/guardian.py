@@ -252,17 +252,21 @@ class Guardian:
         return tuple(map(self._status_of, filter(None, (self._recorder, *self._children.values()))))
 
     def _status_of(self, child: Child) -> ProcessStatus:
-        process = child.process
-        state = self.pulses.state(process) if process in self._ready else "starting"
+        process, pulse = child.process, self.pulses.newest(child.process)
+        if child.handle.poll() is not None:
+            state = "ended"
+        elif pulse is None or process not in self._ready:
+            state = "starting"
+        else:
+            state = "silent" if child.watch.slow else pulse.state
         return ProcessStatus(
             stage=process.stage,
-            replica=process.replica,
             name=self._run.name_of(process),
-            state=state if child.handle.poll() is None else "ended",
+            state=state,
             pid=child.handle.pid,
             restarts=process.incarnation,
             reason=child.restarted_because,
-            pulse=self.pulses.newest(process),
+            pulse=pulse,
             **self.pulses.rates(process),
         )
 
@@ -326,7 +330,7 @@ class Guardian:
         child.replaced_because, child.dies_at = reason, time.monotonic()
         self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
-        if left := self._launch.end_rest(child.process):
+        if left := self._launch.family.end(child.process.path):
             self._say(f"{self._run.name_of(child.process)} {behind(left)}", "warning")
 
     def _start_successor(self, child: Child) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, node_entry
+from runner.graph.graph import Graph, graph_to_json, node_entry
 from runner.graph.placement import Network
 from runner.hosts.head import Hosts
 from runner.message.packet import Process
@@ -15,6 +15,9 @@ from runner.process.health import Watch
 from runner.process.stage_process import Assignment
 from runner.recording.writer import Manifest, topic
 from runner.supervise.child import Child, Progress
+
+RESENT = 1000
+"""Of the messages that may come once more, those that a successor is told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +67,13 @@ class Launcher:
         self._run = run
         self._hosts = hosts
         self._forks = forks
-        self._family = Family()
+        self.family = Family()
+        """What stages and viewer start here."""
 
     def recorder(self, process: Process) -> Child:
         """Starts what writes the recording."""
         run = self._run
-        topics = {
-            f"{stage}/{port}": topic(kind)
-            for stage in (*run.graph.nodes, SUPERVISOR)
-            for port, kind in run.graph.outputs_of(stage).items()
-        }
+        topics = {name: topic(kind) for name, kind in run.graph.topics().items()}
         task = Manifest(
             run.id,
             run.endpoint,
@@ -95,7 +95,7 @@ class Launcher:
         """Starts the viewer on the recording as it grows."""
         log = self._run.directory / "log" / "viewer.txt"
         process = Process("viewer", 0)
-        mark = self._family.mark(process.path)
+        mark = self.family.mark(process.path)
         handle = spawn("runner.cli", "view", "--live", str(self._run.recording), task=b"", log=log, mark=mark)
         return Child(process, handle, log)
 
@@ -108,7 +108,7 @@ class Launcher:
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
             handle = self._hosts.start(host, process, task, log)
         else:
-            module, mark = "runner.process.stage_process", self._family.mark(process.path)
+            module, mark = "runner.process.stage_process", self.family.mark(process.path)
             data = msgspec.json.encode(task)
             handle = self._forks.start(module, run.name_of(process), task=data, log=log, mark=mark)
         return Child(process, handle, log, log_from=log_from, watch=Watch(run.graph.nodes[process.stage].limits))
@@ -129,18 +129,14 @@ class Launcher:
             incarnation=process.incarnation,
             numbers=progress.numbers,
             started=progress.started,
-            consumed=progress.newest_consumed,
+            consumed=tuple(progress.consumed)[-RESENT:],
             undone=tuple(progress.undone),
             gateway=run.gateway,
             network=run.network,
             past=str(run.recording.absolute()) if has_past else "",
         )
 
-    def end_rest(self, process: Process) -> list[str]:
-        """Ends what a stage's process that has gone has left behind here; returns the command lines."""
-        return self._family.end(process.path)
-
     def close(self) -> list[str]:
         """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
         self._forks.close()
-        return self._family.close()
+        return self.family.close()

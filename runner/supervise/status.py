@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict, deque
 from typing import Any
 
 import msgspec
 
-from runner.graph.graph import SUPERVISOR, Graph
+from runner.graph.graph import Graph
 from runner.message.codec import Pulse
 from runner.message.packet import Process
 
-SILENT_NS = 3_000_000_000
 WINDOW = 7
 """Pulses over which rates are taken: three seconds."""
 
@@ -29,11 +27,10 @@ class ProcessStatus(msgspec.Struct, frozen=True):
     """One process of the graph, or the recorder."""
 
     stage: str
-    replica: int
     name: str
     """As log lines call it: with the replica's number where there are several."""
     state: str
-    """``starting``, what its newest pulse says, ``silent`` where that is old, or ``ended``."""
+    """``starting``, what its newest pulse says, ``silent`` while none comes, or ``ended``."""
     pid: int
     restarts: int
     reason: str = ""
@@ -57,15 +54,10 @@ class TopicStatus(msgspec.Struct, frozen=True):
 
 
 class RunStatus(msgspec.Struct, frozen=True):
-    """A whole run."""
+    """A whole run, beyond its :class:`runner.supervise.registry.Entry`."""
 
-    run: str
-    graph: str
-    """Path of the graph file."""
-    recording: str
     endpoint: str
-    started: float
-    """Seconds since the epoch."""
+    """Where others may listen to it."""
     ready: bool
     """Whether every process has been ready at least once, and the recorder is."""
     processes: tuple[ProcessStatus, ...]
@@ -82,21 +74,12 @@ class Pulses:
 
     def note(self, pulse: Pulse, arrived_ns: int) -> None:
         """Takes a pulse as it comes."""
-        process = Process(pulse.stage, pulse.replica, pulse.incarnation)
-        self._pulses[process].append((arrived_ns, pulse))
+        self._pulses[pulse.process].append((arrived_ns, pulse))
 
     def newest(self, process: Process) -> Pulse | None:
         """The newest of a process, if any has come."""
         window = self._pulses.get(process)
         return window[-1][1] if window else None
-
-    def state(self, process: Process) -> str:
-        """What the newest pulse of a process says, ``silent`` where it is old, ``starting`` where there is none."""
-        window = self._pulses.get(process)
-        if not window:
-            return "starting"
-        arrived_ns, newest = window[-1]
-        return newest.state if time.monotonic_ns() - arrived_ns < SILENT_NS else "silent"
 
     def rates(self, process: Process) -> dict[str, Any]:
         """What of a :class:`ProcessStatus` is a rate."""
@@ -118,12 +101,8 @@ def _flow(before: tuple[int, int], now: tuple[int, int], seconds: float) -> Flow
 
 def topics_of(graph: Graph) -> tuple[TopicStatus, ...]:
     """Every output port of a graph, the supervisor's last."""
+    goes_to = graph.destinations()
     return tuple(
-        TopicStatus(f"{stage}/{port}", kind.__name__, _consumers(graph, stage, port))
-        for stage in (*graph.nodes, SUPERVISOR)
-        for port, kind in graph.outputs_of(stage).items()
+        TopicStatus(topic, kind.__name__, tuple(f"{route.consumer}.{route.input}" for route in goes_to.get(topic, ())))
+        for topic, kind in graph.topics().items()
     )
-
-
-def _consumers(graph: Graph, stage: str, port: str) -> tuple[str, ...]:
-    return tuple(f"{route.consumer}.{route.input}" for route in graph.routes(stage) if route.output == port)

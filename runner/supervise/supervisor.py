@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 
@@ -39,7 +38,6 @@ from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import Gateway, new_endpoint, remove_sockets
 
-R = TypeVar("R", bound=msgspec.Struct)
 EXIT_INCOMPLETE = 3
 
 
@@ -69,21 +67,21 @@ class Supervisor:
         endpoint, network = (self._hosts.endpoint, self._hosts.network) if self._hosts else (new_endpoint(), None)
         gateway = new_endpoint(endpoint if network is None else "")
         with naming():
-            id, recording = _new_recording(recordings, graph.name)
-            self._entry = Entry(
-                run=id,
+            self.id, recording = _new_recording(recordings, graph.name)
+            entry = Entry(
+                run=self.id,
                 gateway=gateway,
                 pid=os.getpid(),
                 graph=str(file.absolute()),
                 recording=str(recording.absolute()),
                 started=time.time(),
             )
-            self._registration = Registration(self._entry)
-        self._run = run = Run(id, graph, recording, settings, endpoint, gateway, network, steps_only)
+            self._registration = Registration(entry)
+        self._run = run = Run(self.id, graph, recording, settings, endpoint, gateway, network, steps_only)
         self._own = Process(SUPERVISOR, 0)
-        self._bus = Bus(id, endpoint, network=network, process=self._own, listen=network is None)
+        self._bus = Bus(self.id, endpoint, network=network, process=self._own, listen=network is None)
         self._gateway = Gateway(gateway, endpoint, network, graph.listen)
-        self._gateway.announce(f"{id}/present/{Process(GATEWAY, 0).path}")
+        self._gateway.announce(f"{self.id}/present/{Process(GATEWAY, 0).path}")
         self._stopping = threading.Event()
         warn = partial(self._say, level="warning")
         stopping = self._stopping.is_set
@@ -109,23 +107,18 @@ class Supervisor:
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
 
-    @property
-    def id(self) -> str:
-        """Of the run."""
-        return self._run.id
-
     def run(self, *, view: bool = False) -> End:
         """Runs the graph to its end, with the viewer if wanted, and leaves no process behind."""
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
                 signal.signal(signum, lambda number, _: self._events.put(End(128 + number, "interrupted")))
         self._connect()
-        where = f"run {self._run.id} on {self._graph.listen or self._run.gateway}"
+        where = f"run {self.id} on {self._graph.listen or self._run.gateway}"
         self._terminal.show(SUPERVISOR, f"{where} starts {len(self._graph.processes())} processes")
         try:
             self._guardian.start_recorder(view=view)
             if self._hosts is not None:
-                self._hosts.open(self._run.id, self._run.recording)
+                self._hosts.open(self.id, self._run.recording)
             self._guardian.start_stages()
             end = self._watch()
         finally:
@@ -148,25 +141,18 @@ class Supervisor:
     # ------------------------------------------------------------------------------------------ what is heard
 
     def _connect(self) -> None:
-        self._hear("j/*", Journal, self._on_journal)
-        self._hear("l/*", LogLine, self._on_log)
-        self._hear("h/**", Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns))
-        self._hear(f"m/*/{FINISHED}", Envelope, self._on_finished)
+        hear, reading = self._bus.subscribe, self._refusals.reading
+        hear("j/*", reading(Journal, self._on_journal))
+        hear("l/*", reading(LogLine, self._on_log))
+        hear("h/**", reading(Pulse, lambda pulse, packet: self._guardian.pulses.note(pulse, packet.arrived_ns)))
+        hear(f"m/*/{FINISHED}", reading(Envelope, self._on_finished))
+        note_answer = reading(Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
         for key in self._calls.answer_keys:
-            self._hear(f"m/{key}", Envelope, lambda answer, packet: self._calls.note_answer(answer.id, packet.payload))
-        self._bus.subscribe("settled/**", partial(self._on_word, self._guardian.settled))
-        self._bus.subscribe("e/**", partial(self._on_word, self._guardian.quiet))
+            hear(f"m/{key}", note_answer)
+        hear("settled/**", self._refusals.naming(self._guardian.settled.add))
+        hear("e/**", self._refusals.naming(self._guardian.quiet.add))
         self._serve()
         self._bus.watch(self._on_presence, self._refusals.refuse)
-
-    def _hear(self, path: str, kind: type[R], note: Callable[[R, Packet], None]) -> None:
-        """Has everything noted that is sent to a path; what is not of its kind is refused."""
-
-        def take(packet: Packet) -> None:
-            if (record := self._refusals.read(kind, packet)) is not None:
-                note(record, packet)
-
-        self._bus.subscribe(path, take)
 
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
         self._delivery.answered(packet.end, journal.answered)
@@ -192,13 +178,6 @@ class Supervisor:
             self._refusals.refuse(packet.key, error)
         else:
             self._events.put(End(finished.code, finished.reason))
-
-    def _on_word(self, named: set[Process], packet: Packet) -> None:
-        """What is said of the process that a key names."""
-        try:
-            named.add(Process.of(packet.key))
-        except Refused as refusal:
-            self._refusals.refuse(packet.key, refusal)
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if present:
@@ -292,11 +271,7 @@ class Supervisor:
 
     def _status(self) -> RunStatus:
         return RunStatus(
-            run=self._run.id,
-            graph=self._entry.graph,
-            recording=self._entry.recording,
             endpoint=self._graph.listen or self._run.gateway,
-            started=self._entry.started,
             ready=not self._guardian.awaited(),
             processes=self._guardian.status(),
             topics=topics_of(self._graph),

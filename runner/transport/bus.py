@@ -17,7 +17,7 @@ import traceback
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
@@ -33,8 +33,6 @@ from runner.transport.session import (
     open_session,
     private,
 )
-
-A = TypeVar("A")
 
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
@@ -128,14 +126,20 @@ class Bus:
         self._declare(self._listener or self._session, path, self._taker(take))
 
     def _taker(self, take: Callable[[Packet], None]) -> Callback[zenoh.Sample]:
-        def receive(sample: zenoh.Sample) -> None:
-            take(self._packet(sample))
+        return Callback(lambda sample: take(self._packet(sample)), indirect=False)
 
-        return Callback(receive, indirect=False)
+    def channel(self, path: str) -> Callable[[], Iterator[Packet]]:
+        """Takes all that has been sent to ``path`` by others, whenever it is called; when it came is not known.
 
-    def channel(self, path: str) -> Channel:
-        """Everything sent to ``path`` by others, to be taken when the time has come: cheaper than calls one by one."""
-        return Channel(self._declare(self._session, path, FifoChannel(CHANNEL)), len(self._run) + 1)
+        Cheaper than calls one by one.
+        """
+        subscriber = self._declare(self._session, path, FifoChannel(CHANNEL))
+
+        def take() -> Iterator[Packet]:
+            while (sample := subscriber.try_recv()) is not None:
+                yield Packet(self._path(sample), sample.payload.to_bytes(), 0, 0)
+
+        return take
 
     def _declare(self, session: zenoh.Session, path: str, handler: Any) -> zenoh.Subscriber[Any]:
         origin = zenoh.Locality.REMOTE  # who publishes knows it already
@@ -144,8 +148,11 @@ class Bus:
         return found
 
     def _packet(self, sample: zenoh.Sample) -> Packet:
-        arrived_ns, key = time.monotonic_ns(), str(sample.key_expr)[len(self._run) + 1 :]
-        return Packet(key, sample.payload.to_bytes(), _sent_ns(sample), arrived_ns)
+        arrived_ns = time.monotonic_ns()
+        return Packet(self._path(sample), sample.payload.to_bytes(), _sent_ns(sample), arrived_ns)
+
+    def _path(self, sample: zenoh.Sample) -> str:
+        return str(sample.key_expr)[len(self._run) + 1 :]
 
     def announce(self) -> None:
         """Declares this process present, until it closes or dies."""
@@ -172,10 +179,11 @@ class Bus:
                 close_dead_links_at_once()
             callback(process, present)
 
-        subscriber = self._session.liveliness().declare_subscriber(
-            f"{self._run}/present/**", self._in_turn(receive), history=True
-        )
-        self._declared.append(subscriber)
+        def take_in_turn(sample: zenoh.Sample) -> None:
+            self._calls.put(lambda: receive(sample))
+
+        key, callback_in_turn = f"{self._run}/present/**", Callback(take_in_turn, indirect=False)
+        self._declared.append(self._session.liveliness().declare_subscriber(key, callback_in_turn, history=True))
 
     def serve(self, name: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the questions called ``name``, each on a thread of its own: an answer may take its time.
@@ -212,10 +220,6 @@ class Bus:
         for session in filter(None, (self._listener, self._session)):
             close_session(session)
 
-    def _in_turn(self, receive: Callable[[A], None]) -> Callback[A]:
-        """A handler that only queues, so that it may run on the link's own thread."""
-        return Callback(lambda cause: self._calls.put(lambda: receive(cause)), indirect=False)
-
     def _call_all(self) -> None:
         """What a callback raises ends the process, with the traceback: it cannot go on half deaf."""
         try:
@@ -225,20 +229,6 @@ class Bus:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(1)
-
-
-class Channel:
-    """What has been sent to one process and waits to be taken; when it came is not known."""
-
-    def __init__(self, subscriber: zenoh.Subscriber[Any], prefix: int):
-        """``prefix`` is the length of what stands before the keys, the run."""
-        self._subscriber = subscriber
-        self._prefix = prefix
-
-    def take(self) -> Iterator[Packet]:
-        """All that is there."""
-        while (sample := self._subscriber.try_recv()) is not None:
-            yield Packet(str(sample.key_expr)[self._prefix :], sample.payload.to_bytes(), 0, 0)
 
 
 def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:

@@ -16,10 +16,11 @@ import socket
 import stat
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 import zenoh
 
 from runner.contract import Refused
@@ -91,29 +92,10 @@ def private(endpoint: str) -> str:
 
 def close_dead_links_at_once() -> None:
     """Zenoh has links linger for 10 s when they are closed: to a machine that is gone, with all else standing still."""
-    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names of descriptors, not paths
-        with contextlib.suppress(OSError):
-            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                with socket.socket(fileno=os.dup(int(name))) as link:
-                    _let_go(link)
-
-
-def _let_go(link: socket.socket) -> None:
-    if link.family in (socket.AF_INET, socket.AF_INET6) and link.type == socket.SOCK_STREAM:
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
-        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
-
-
-class Router:
-    """Where the sessions of a routed network meet: it forwards between those that do not link to each other."""
-
-    def __init__(self, endpoint: str, network: Network):
-        """Raises Refused where this machine cannot listen there."""
-        self._session = open_session([endpoint], [], network, mode="router")
-
-    def close(self) -> None:
-        """Lets everybody go."""
-        self._session.close()
+    for found in psutil.Process().net_connections("tcp"):
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(found.fd)) as link:
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LEASE_MS)
 
 
 class Gateway:
@@ -154,10 +136,30 @@ def open_session(
     network: Network | None = None,
     *,
     mode: str = "peer",
-    settings: dict[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
     """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes a client."""
-    config = _config(list(listen), list(connect), network, mode, settings or {})
+    calls_once = mode == "client" and not (network is not None and network.routed)
+    told: dict[str, Any] = {
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        # A router may be started after those that call it.
+        "connect/timeout_ms": CALL_MS if calls_once else -1,
+        "connect/exit_on_failure": calls_once,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        # Every reader would have to lock the publisher's pool in memory, and without a word gets nothing where it may
+        # not; what a process reads that stands still is overwritten. See docs/runner/performance.md.
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
+        "transport/link/tx/lease": PATIENT_LEASE_MS if network is None or network.credentials is None else LEASE_MS,
+    }
+    if network is not None and network.credentials is not None:
+        told |= security(network, network.credentials)
+    config = zenoh.Config()
+    for key, value in {**told, **(settings or {})}.items():
+        config.insert_json5(key, json.dumps(value))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -176,30 +178,3 @@ def close_session(session: zenoh.Session) -> None:
     closer = threading.Thread(target=close, name="close", daemon=True)
     closer.start()
     closer.join(CLOSE_SECONDS)
-
-
-def _config(
-    listen: list[str], connect: list[str], network: Network | None, mode: str, more: dict[str, Any]
-) -> zenoh.Config:
-    calls_once = mode == "client" and not (network is not None and network.routed)
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
-        # A router may be started after those that call it.
-        "connect/timeout_ms": CALL_MS if calls_once else -1,
-        "connect/exit_on_failure": calls_once,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-        # Every reader would have to lock the publisher's pool in memory, and without a word gets nothing where it may
-        # not; what a process reads that stands still is overwritten. See docs/runner/performance.md.
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
-        "transport/link/tx/lease": PATIENT_LEASE_MS if network is None or network.credentials is None else LEASE_MS,
-    }
-    if network is not None and network.credentials is not None:
-        settings |= security(network, network.credentials)
-    config = zenoh.Config()
-    for key, value in {**settings, **more}.items():
-        config.insert_json5(key, json.dumps(value))
-    return config

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,37 +11,48 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from runner.graph.graph import graph_from_json
+from runner.message.codec import Envelope
 from runner.view import drawing as d
+from runner.view.views import drawn, load_views
 
 STEP = "step"
 TIME = "time"
 
 
 class Canvas:
-    """One Rerun stream with a ``step`` timeline (one step per message or animation frame) and the logical ``time``."""
+    """One Rerun stream that shows the messages of one graph, with the views that the graph names.
 
-    def __init__(self, stream: rr.RecordingStream, views: d.Views) -> None:
-        """Sends the arrangement of the panels and what never changes."""
+    Its timelines are ``step`` (one step per message or animation frame) and the logical ``time``.
+    """
+
+    def __init__(self, graph_json: str, path: Path, stream: rr.RecordingStream) -> None:
+        """Sends the arrangement of the panels and what never changes.
+
+        ``path`` is the recording's. Raises Refused where the graph has no views.
+        """
+        self._graph = graph_from_json(graph_json, str(path))
+        self._views = load_views(self._graph)
         self._stream = stream
         self._step = -1
-        stream.send_blueprint(_blueprint(views.layout()), make_active=True, make_default=True)
-        for drawing in views.static():
+        stream.send_blueprint(_blueprint(self._views.layout()), make_active=True, make_default=True)
+        for drawing in self._views.static():
             self._put(drawing, static=True)
 
-    def show(self, drawings: Iterable[d.Drawing], *, time_ns: int) -> None:
-        """Draws on a new step at logical time ``time_ns``; messages without a drawing take no step."""
+    def draw(self, sealed: Envelope) -> None:
+        """Draws one message on a new step; one without a drawing takes none.
+
+        What cannot be drawn is named on stderr and left out.
+        """
         fresh = True
-        for drawing in drawings:
+        for drawing in drawn(self._graph, self._views, sealed):
             if fresh or isinstance(drawing, d.NextStep):
-                self._advance(time_ns)
+                self._step += 1
+                self._stream.set_time(STEP, sequence=self._step)
+                self._stream.set_time(TIME, duration=np.timedelta64(sealed.time_ns, "ns"))
                 fresh = False
             if not isinstance(drawing, d.NextStep):
                 self._put(drawing)
-
-    def _advance(self, time_ns: int) -> None:
-        self._step += 1
-        self._stream.set_time(STEP, sequence=self._step)
-        self._stream.set_time(TIME, duration=np.timedelta64(time_ns, "ns"))
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
         found = _ARCHETYPES[type(drawing)](drawing)

@@ -12,9 +12,9 @@ pixels are OpenCV's (pixel centres at integer coordinates), colours are sRGB byt
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,15 +25,13 @@ Bytes = NDArray[np.uint8]
 Color = tuple[int, int, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Drawing:
+class Drawing(msgspec.Struct, frozen=True):
     """What stands at a path."""
 
     path: str
 
 
-@dataclass(frozen=True, slots=True)
-class Image(Drawing):
+class Image(Drawing, frozen=True):
     """A colour image. Images below one path are laid over each other; a lower ``opacity`` lets the other show."""
 
     rgb: Bytes
@@ -41,8 +39,7 @@ class Image(Drawing):
     opacity: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class DepthImage(Drawing):
+class DepthImage(Drawing, frozen=True):
     """A depth image, coloured by distance. Below a :class:`Pinhole` it also becomes a point cloud in space."""
 
     depth: Floats
@@ -52,8 +49,7 @@ class DepthImage(Drawing):
     farthest: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Boxes2D(Drawing):
+class Boxes2D(Drawing, frozen=True):
     """Axis-aligned boxes over an image, each with a label."""
 
     boxes: Floats
@@ -63,8 +59,7 @@ class Boxes2D(Drawing):
     """One per box, or none for the viewer's choice."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pinhole(Drawing):
+class Pinhole(Drawing, frozen=True):
     """Makes ``path`` a camera: what lies below it is its image; z forward, x right, y down."""
 
     K: Floats
@@ -73,16 +68,14 @@ class Pinhole(Drawing):
     height: int
 
 
-@dataclass(frozen=True, slots=True)
-class Transform(Drawing):
+class Transform(Drawing, frozen=True):
     """Places ``path`` and everything below it in the frame above."""
 
     T: Floats
     """4 x 4, ``T_parent_path``."""
 
 
-@dataclass(frozen=True, slots=True)
-class Mesh3D(Drawing):
+class Mesh3D(Drawing, frozen=True):
     """Triangles in the frame of ``path``."""
 
     vertices: Floats
@@ -93,8 +86,7 @@ class Mesh3D(Drawing):
     """V x 3, or one colour for all."""
 
 
-@dataclass(frozen=True, slots=True)
-class Points3D(Drawing):
+class Points3D(Drawing, frozen=True):
     """Points in the frame of ``path``."""
 
     positions: Floats
@@ -105,8 +97,7 @@ class Points3D(Drawing):
     """Metres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lines3D(Drawing):
+class Lines3D(Drawing, frozen=True):
     """Polylines in the frame of ``path``."""
 
     strips: tuple[Floats, ...]
@@ -116,15 +107,13 @@ class Lines3D(Drawing):
     """Metres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Text(Drawing):
+class Text(Drawing, frozen=True):
     """A page of Markdown."""
 
     markdown: str
 
 
-@dataclass(frozen=True, slots=True)
-class Graph(Drawing):
+class Graph(Drawing, frozen=True):
     """A graph of labelled nodes."""
 
     nodes: tuple[str, ...]
@@ -139,8 +128,7 @@ class Graph(Drawing):
     """N x 2, x right and y down in pixels; laid out by the viewer by default."""
 
 
-@dataclass(frozen=True, slots=True)
-class Scalar(Drawing):
+class Scalar(Drawing, frozen=True):
     """One value of a curve over steps."""
 
     value: float
@@ -148,8 +136,7 @@ class Scalar(Drawing):
     """In the legend; the path's last part by default."""
 
 
-@dataclass(frozen=True, slots=True)
-class BarChart(Drawing):
+class BarChart(Drawing, frozen=True):
     """One bar per value."""
 
     values: Floats
@@ -157,13 +144,11 @@ class BarChart(Drawing):
     color: Color | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Clear(Drawing):
+class Clear(Drawing, frozen=True):
     """Removes what stands at ``path`` and below it."""
 
 
-@dataclass(frozen=True, slots=True)
-class NextStep(Drawing):
+class NextStep(Drawing, frozen=True):
     """What follows is shown one step later: yielded between the frames of an animation, as a filter's iterations."""
 
     path: str = ""
@@ -172,8 +157,7 @@ class NextStep(Drawing):
 PanelKind = Literal["image", "space", "graph", "text", "bars", "series"]
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+class Panel(msgspec.Struct, frozen=True):
     """One view on the drawings at and below ``origin``; ``contents`` adds or restricts what it shows.
 
     ``contents`` are path expressions relative to the root: ``"/world/**"`` includes a subtree and
@@ -190,24 +174,21 @@ class Panel:
     """The point in its middle."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(msgspec.Struct, frozen=True):
     """Layouts side by side; ``shares`` are relative widths, equal by default."""
 
     parts: tuple[Layout, ...]
     shares: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(msgspec.Struct, frozen=True):
     """Layouts above each other; ``shares`` are relative heights, equal by default."""
 
     parts: tuple[Layout, ...]
     shares: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Tabs:
+class Tabs(msgspec.Struct, frozen=True):
     """Layouts behind tabs, the first one open."""
 
     parts: tuple[Layout, ...]

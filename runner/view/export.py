@@ -11,29 +11,20 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from runner.contract import Refused
 from runner.graph.graph import Graph, graph_from_json
 from runner.message.codec import LogLine
 from runner.recording.container import new_file
 from runner.recording.recording import Recording
 from runner.view import drawing as d
 from runner.view.views import drawn, load_views
-
-if TYPE_CHECKING:
-    from foxglove import messages as fox
-    from scipy.spatial.transform import Rotation
-else:
-    try:
-        from foxglove import messages as fox
-        from scipy.spatial.transform import Rotation
-    except ImportError:
-        fox = None
 
 STEP_NS = 33_000_000
 """Between the steps of an animation."""
@@ -43,24 +34,25 @@ _GREY: d.Color = (180, 180, 180)
 
 Written = tuple[str, Any]
 """A topic, and a Foxglove message or a dict that becomes JSON."""
+Head = dict[str, Any]
+"""With which most messages begin: ``timestamp`` and ``frame_id``."""
 
 
 def export(path: Path, target: Path) -> list[str]:
     """Writes a recording's drawings and log; returns lines that say what was written.
 
-    Raises Refused where the SDK is missing, the file is no recording, its graph has no views or the target exists.
+    Raises Refused where the file is no recording, its graph has no views or the target exists.
     """
-    if fox is None:
-        raise Refused("runner export: the Foxglove SDK is missing; type: pip install 'scene-programming[foxglove]'")
     recording = Recording(path)
     graph = graph_from_json(recording.run["graph"], str(path))
     views = load_views(graph)
     with new_file(target) as output:
-        sink = _Sink(Writer(output, compression=CompressionType.ZSTD))
+        writer = Writer(output, compression=CompressionType.ZSTD)
+        sink = _Sink(writer)
         for line in recording.log:
             sink.put([(LOGS, _log_line(line))], line.time_ns)
         _write_drawings(recording, graph, views, sink)
-        sink.finish()
+        writer.finish()
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(sink.counts.items()))
     return [f"{path}: {recording.verdict}", f"{target}: {kinds or 'nothing to show'}"]
 
@@ -106,9 +98,6 @@ class _Sink:
             self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
             self.counts["JSON" if plain else type(message).__name__] += 1
 
-    def finish(self) -> None:
-        self._writer.finish()
-
     def _register(self, topic: str, message: Any) -> int:
         if isinstance(message, dict):
             schema = self._writer.register_schema("drawing", "jsonschema", b'{"type": "object"}')
@@ -138,8 +127,9 @@ class _Scribe:
 
     def _one(self, drawing: d.Drawing, now: int) -> Written:
         path = _clean(drawing)
-        frame = self._parent(path) if isinstance(drawing, d.Transform) else self._frame(path)
-        message = _MESSAGES[type(drawing)](drawing, path, frame, _stamp(now))
+        places = isinstance(drawing, d.Transform)
+        frame = self._frame(path.rpartition("/")[0]) or "root" if places else self._frame(path)
+        message = _MESSAGES[type(drawing)](drawing, path, {"timestamp": _stamp(now), "frame_id": frame})
         return _TOPICS.get(type(drawing), f"/{path}"), message
 
     def _frame(self, path: str) -> str:
@@ -147,10 +137,6 @@ class _Scribe:
         parts = path.split("/")
         above = ("/".join(parts[:length]) for length in range(len(parts), 0, -1))
         return next((place for place in above if place in self._frames), parts[0])
-
-    def _parent(self, path: str) -> str:
-        above = path.rpartition("/")[0]
-        return self._frame(above) if above else "root"
 
     def _cleared(self, path: str, now: int) -> Iterator[Written]:
         gone = [place for place in self._standing if place == path or place.startswith(f"{path}/")]
@@ -176,30 +162,24 @@ def _clean(drawing: d.Drawing) -> str:
     return drawing.path.strip("/")
 
 
-def _image(image: d.Image, path: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
-    return _raw_image(image.rgb, "rgba8" if image.rgb.shape[2] == 4 else "rgb8", frame, stamp)
+def _image(image: d.Image, _: str, head: Head) -> fox.RawImage:
+    return _raw_image(image.rgb, "rgba8" if image.rgb.shape[2] == 4 else "rgb8", head)
 
 
-def _depth(depth: d.DepthImage, path: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
+def _depth(depth: d.DepthImage, _: str, head: Head) -> fox.RawImage:
     """Metres as they are, in 32-bit floats."""
-    return _raw_image(np.asarray(depth.depth, np.float32), "32FC1", frame, stamp)
+    return _raw_image(np.asarray(depth.depth, np.float32), "32FC1", head)
 
 
-def _raw_image(pixels: NDArray[Any], encoding: str, frame: str, stamp: fox.Timestamp) -> fox.RawImage:
+def _raw_image(pixels: NDArray[Any], encoding: str, head: Head) -> fox.RawImage:
     pixels = np.ascontiguousarray(pixels)
     height, width = pixels.shape[:2]
-    return fox.RawImage(
-        timestamp=stamp,
-        frame_id=frame,
-        width=width,
-        height=height,
-        encoding=encoding,
-        step=pixels.strides[0],
-        data=pixels.tobytes(),
-    )
+    step, data = pixels.strides[0], pixels.tobytes()
+    return fox.RawImage(**head, width=width, height=height, encoding=encoding, step=step, data=data)
 
 
-def _boxes(boxes: d.Boxes2D, path: str, frame: str, stamp: fox.Timestamp) -> fox.ImageAnnotations:
+def _boxes(boxes: d.Boxes2D, _: str, head: Head) -> fox.ImageAnnotations:
+    stamp = head["timestamp"]
     colors = [_color(color) for color in boxes.colors or (_GREY,) * len(boxes.boxes)]
     corners = boxes.boxes.tolist()
     outlines = [_outline(box, color, stamp) for box, color in zip(corners, colors, strict=True)]
@@ -219,11 +199,10 @@ def _outline(box: Sequence[float], color: fox.Color, stamp: fox.Timestamp) -> fo
     return fox.PointsAnnotation(timestamp=stamp, type=kind, points=corners, outline_color=color, thickness=2)
 
 
-def _pinhole(camera: d.Pinhole, path: str, frame: str, stamp: fox.Timestamp) -> fox.CameraCalibration:
+def _pinhole(camera: d.Pinhole, _: str, head: Head) -> fox.CameraCalibration:
     K = np.asarray(camera.K, np.float64)
     return fox.CameraCalibration(
-        timestamp=stamp,
-        frame_id=frame,
+        **head,
         width=camera.width,
         height=camera.height,
         K=K.ravel().tolist(),
@@ -232,7 +211,7 @@ def _pinhole(camera: d.Pinhole, path: str, frame: str, stamp: fox.Timestamp) -> 
     )
 
 
-def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.PointCloud:
+def _points(points: d.Points3D, _: str, head: Head) -> fox.PointCloud:
     """Each point as three 32-bit floats and four bytes of colour."""
     packed = np.zeros(len(points.positions), np.dtype([("position", "<f4", 3), ("color", "u1", 4)]))
     packed["position"] = points.positions
@@ -244,8 +223,7 @@ def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> 
     channels = enumerate(("red", "green", "blue", "alpha"))
     fields += [fox.PackedElementField(name=name, offset=12 + k, type=byte) for k, name in channels]
     return fox.PointCloud(
-        timestamp=stamp,
-        frame_id=frame,
+        **head,
         pose=_still(),
         point_stride=packed.itemsize,
         fields=fields,
@@ -253,19 +231,19 @@ def _points(points: d.Points3D, path: str, frame: str, stamp: fox.Timestamp) -> 
     )
 
 
-def _transform(place: d.Transform, path: str, frame: str, stamp: fox.Timestamp) -> fox.FrameTransform:
+def _transform(place: d.Transform, path: str, head: Head) -> fox.FrameTransform:
     x, y, z = place.T[:3, 3].tolist()
     i, j, k, w = Rotation.from_matrix(place.T[:3, :3]).as_quat().tolist()
     return fox.FrameTransform(
-        timestamp=stamp,
-        parent_frame_id=frame,
+        timestamp=head["timestamp"],
+        parent_frame_id=head["frame_id"],
         child_frame_id=path,
         translation=fox.Vector3(x=x, y=y, z=z),
         rotation=fox.Quaternion(x=i, y=j, z=k, w=w),
     )
 
 
-def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.SceneUpdate:
+def _mesh(mesh: d.Mesh3D, path: str, head: Head) -> fox.SceneUpdate:
     several = None if mesh.colors is None or isinstance(mesh.colors, tuple) else mesh.colors
     triangles = fox.TriangleListPrimitive(
         pose=_still(),
@@ -274,10 +252,10 @@ def _mesh(mesh: d.Mesh3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.Sc
         colors=None if several is None else [_color(color) for color in several.tolist()],
         indices=mesh.faces.ravel().tolist(),
     )
-    return _entity(path, frame, stamp, triangles=[triangles])
+    return _entity(path, head, triangles=[triangles])
 
 
-def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> fox.SceneUpdate:
+def _lines(lines: d.Lines3D, path: str, head: Head) -> fox.SceneUpdate:
     strips = [
         fox.LinePrimitive(
             type=fox.LinePrimitiveLineType.LineStrip,
@@ -288,16 +266,15 @@ def _lines(lines: d.Lines3D, path: str, frame: str, stamp: fox.Timestamp) -> fox
         )
         for strip in lines.strips
     ]
-    return _entity(path, frame, stamp, lines=strips)
+    return _entity(path, head, lines=strips)
 
 
-def _entity(path: str, frame: str, stamp: fox.Timestamp, **shapes: Any) -> fox.SceneUpdate:
-    entity = fox.SceneEntity(timestamp=stamp, frame_id=frame, id=path, frame_locked=True, **shapes)
-    return fox.SceneUpdate(entities=[entity])
+def _entity(path: str, head: Head, **shapes: Any) -> fox.SceneUpdate:
+    return fox.SceneUpdate(entities=[fox.SceneEntity(**head, id=path, frame_locked=True, **shapes)])
 
 
-def _text(text: d.Text, path: str, frame: str, stamp: fox.Timestamp) -> fox.Log:
-    return fox.Log(timestamp=stamp, level=fox.LogLevel.Info, name=path, message=text.markdown)
+def _text(text: d.Text, path: str, head: Head) -> fox.Log:
+    return fox.Log(timestamp=head["timestamp"], level=fox.LogLevel.Info, name=path, message=text.markdown)
 
 
 def _log_line(line: LogLine) -> fox.Log:
@@ -306,17 +283,13 @@ def _log_line(line: LogLine) -> fox.Log:
     return fox.Log(timestamp=_stamp(line.time_ns), level=level, name=name, message=line.text)
 
 
-def _graph(graph: d.Graph, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
+def _graph(graph: d.Graph, _: str, __: Head) -> dict[str, Any]:
     nodes = [{"name": name, "label": label} for name, label in zip(graph.nodes, graph.labels, strict=True)]
     return {"nodes": nodes, "edges": [list(edge) for edge in graph.edges]}
 
 
-def _scalar(scalar: d.Scalar, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
+def _scalar(scalar: d.Scalar, path: str, _: Head) -> dict[str, Any]:
     return {"name": scalar.name or path.rpartition("/")[2], "value": scalar.value}
-
-
-def _bars(bars: d.BarChart, path: str, frame: str, stamp: fox.Timestamp) -> dict[str, Any]:
-    return {"values": np.asarray(bars.values, np.float64).tolist()}
 
 
 def _color(color: Sequence[int]) -> fox.Color:
@@ -335,7 +308,7 @@ def _points3(points: d.Floats) -> list[fox.Point3]:
 
 _TOPICS: dict[type, str] = {d.Transform: "/tf", d.Mesh3D: SCENE, d.Lines3D: SCENE}
 """Of drawings whose messages say themselves where they belong; others have the topic of their path."""
-_MESSAGES: dict[type, Callable[[Any, str, str, Any], Any]] = {
+_MESSAGES: dict[type, Callable[[Any, str, Head], Any]] = {
     d.Image: _image,
     d.DepthImage: _depth,
     d.Boxes2D: _boxes,
@@ -347,6 +320,6 @@ _MESSAGES: dict[type, Callable[[Any, str, str, Any], Any]] = {
     d.Text: _text,
     d.Graph: _graph,
     d.Scalar: _scalar,
-    d.BarChart: _bars,
+    d.BarChart: lambda bars, *_: {"values": np.asarray(bars.values, np.float64).tolist()},
 }
-"""By drawing: makes a Foxglove message, or a dict, of it, its path, its frame and the time."""
+"""By drawing: makes a Foxglove message, or a dict, of it, its path and its head."""

@@ -20,14 +20,12 @@ import rerun_cli
 from mcap.records import Metadata
 
 from runner.contract import Refused
-from runner.graph.graph import graph_from_json
 from runner.message.codec import CodecError, Envelope, unpack
 from runner.process.children import bound
-from runner.recording.container import Container, Entry, Growing, is_being_written, open_file
+from runner.recording.container import Container, Entry, Growing, is_being_written, open_file, recordings_in
 from runner.recording.recording import RUN, Recording, payload_kind
 from runner.terminal import has_display
 from runner.view.canvas import Canvas
-from runner.view.views import drawn, load_views
 
 RERUN = str(Path(rerun_cli.__file__).with_name("rerun"))
 """The viewer itself: ``python -m rerun`` would stay between it and the signals that end it."""
@@ -37,20 +35,6 @@ WINDOW = (1280, 800)
 """Size of the window of a picture, in points of two pixels."""
 PACKAGES = "xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libxcursor1 libxi6 libxrandr2"
 SCREENSHOT_SECONDS = 120
-
-
-class Show:
-    """Draws the messages of one graph onto a Rerun stream, with the views the graph names."""
-
-    def __init__(self, graph_json: str, path: Path, stream: rr.RecordingStream) -> None:
-        """``path`` is the recording's. Raises Refused where the graph has no views."""
-        self._graph = graph_from_json(graph_json, str(path))
-        self._views = load_views(self._graph)
-        self._canvas = Canvas(stream, self._views)
-
-    def draw(self, sealed: Envelope) -> None:
-        """Draws one message; what cannot be drawn is named on stderr and left out."""
-        self._canvas.show(drawn(self._graph, self._views, sealed), time_ns=sealed.time_ns)
 
 
 # ------------------------------------------------------------------------------------ recordings
@@ -72,9 +56,9 @@ def save_rrd(recording: Recording, target: Path) -> None:
     """Draws a whole recording into a Rerun file."""
     stream = _stream(recording.path)
     stream.save(target)
-    show = Show(recording.run["graph"], recording.path, stream)
+    canvas = Canvas(recording.run["graph"], recording.path, stream)
     for sealed in recording.envelopes():
-        show.draw(sealed)
+        canvas.draw(sealed)
     stream.flush()
     stream.disconnect()
 
@@ -103,7 +87,7 @@ def view_live(path: Path | None = None) -> None:
 
 def newest_live(folder: Path) -> Path:
     """The newest recording that a running graph writes; raises Refused where there is none."""
-    for path in sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True):
+    for path in recordings_in(folder):
         with path.open("rb") as file:
             if is_being_written(file):
                 return path
@@ -112,14 +96,14 @@ def newest_live(folder: Path) -> Path:
 
 def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool] = lambda: False) -> None:
     """Draws what a recording holds and goes on as it grows, until its graph has ended or ``stopped()``."""
-    show: Show | None = None
+    canvas: Canvas | None = None
     with open_file(path) as file:
         for record in Container(Growing(file, stopped), str(path)):
             if isinstance(record, Metadata) and record.name == RUN:
-                show = Show(record.metadata["graph"], path, stream)
-            elif isinstance(record, Entry) and payload_kind(record.topic) is Envelope and show is not None:
+                canvas = Canvas(record.metadata["graph"], path, stream)
+            elif isinstance(record, Entry) and payload_kind(record.topic) is Envelope and canvas is not None:
                 with contextlib.suppress(CodecError):
-                    show.draw(unpack(Envelope, record.message.data))
+                    canvas.draw(unpack(Envelope, record.message.data))
     stream.flush()
 
 

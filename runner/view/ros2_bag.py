@@ -5,32 +5,25 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+import msgspec
+
 from runner.contract import Message, Refused
 from runner.graph.graph import Graph, graph_from_json
-from runner.message.codec import open_envelope
-from runner.message.ids import MessageId
-from runner.recording.recording import Recording
-from runner.view.views import load_views
+from runner.recording.recording import Recording, opened
+from runner.view.views import load_views, require
 
 if TYPE_CHECKING:
-    from rosbags import rosbag2
     from rosbags.interfaces import Connection
-else:
-    try:
-        from rosbags import rosbag2
-    except ImportError:
-        rosbag2 = None
+    from rosbags.rosbag2 import Writer
 
 _VERSION = 9
 """Of the bag's format: Kilted's; Jazzy reads it too."""
 
 
-@dataclass(frozen=True, slots=True)
-class BagMessage:
+class BagMessage(msgspec.Struct, frozen=True):
     """A message of a topic, with all that a bag must know of its type."""
 
     topic: str
@@ -58,8 +51,9 @@ def export_bag(path: Path, target: Path) -> list[str]:
 
     Raises Refused where rosbags is missing, the file is no recording, its views say nothing or the target exists.
     """
-    if rosbag2 is None:
-        raise Refused("runner export: rosbags is missing; type: pip install 'scene-programming[ros2]'")
+    require("rosbags", "runner export: rosbags", "ros2")
+    from rosbags import rosbag2
+
     recording = Recording(path)
     graph = graph_from_json(recording.run["graph"], str(path))
     views = load_views(graph)
@@ -69,7 +63,9 @@ def export_bag(path: Path, target: Path) -> list[str]:
         raise Refused(f"{target}: cannot be written: File exists")
     part = target.with_name(f"{target.name}.part")
     try:
-        counts = _write(part / target.name, _said(recording, graph, views))
+        plugin = rosbag2.StoragePlugin.MCAP
+        with rosbag2.Writer(part / target.name, version=_VERSION, storage_plugin=plugin) as writer:
+            counts = _write(writer, _said(recording, graph, views))
         (part / target.name).rename(target)
     except (rosbag2.WriterError, OSError) as error:
         raise Refused(f"{target}: cannot be written: {error}") from None
@@ -79,25 +75,22 @@ def export_bag(path: Path, target: Path) -> list[str]:
     return [f"{path}: {recording.verdict}", *(written or [f"{target}: nothing to say"])]
 
 
-def _write(folder: Path, messages: Iterable[tuple[int, BagMessage]]) -> Counter[str]:
+def _write(writer: Writer, messages: Iterable[tuple[int, BagMessage]]) -> Counter[str]:
     """Returns how many there are by topic."""
     counts: Counter[str] = Counter()
     connections: dict[str, Connection] = {}
-    with rosbag2.Writer(folder, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
-        for time_ns, one in messages:
-            if one.topic not in connections:
-                added = writer.add_connection(one.topic, one.type, msgdef=one.definition, rihs01=one.hash)
-                connections[one.topic] = added
-            writer.write(connections[one.topic], time_ns, one.data)
-            counts[one.topic] += 1
+    for time_ns, one in messages:
+        if one.topic not in connections:
+            added = writer.add_connection(one.topic, one.type, msgdef=one.definition, rihs01=one.hash)
+            connections[one.topic] = added
+        writer.write(connections[one.topic], time_ns, one.data)
+        counts[one.topic] += 1
     return counts
 
 
 def _said(recording: Recording, graph: Graph, views: Ros2Views) -> Iterator[tuple[int, BagMessage]]:
     """In the order of recording, with the times of it."""
     for id, message in recording.messages.items():
-        name = MessageId.of(id)
-        kind = graph.outputs_of(name.stage).get(name.port)
-        if kind is not None:
-            for one in views.ros2(open_envelope(kind, recording.envelope(id)), message.log_time_ns):
+        if (content := opened(graph, recording.envelope(id))) is not None:
+            for one in views.ros2(content, message.log_time_ns):
                 yield message.log_time_ns, one

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from importlib.util import find_spec
-from typing import cast
 
 from runner.contract import Refused
-from runner.graph.graph import Graph, node_entry
+from runner.graph.graph import Graph
 from runner.message.codec import Envelope, open_envelope
-from runner.message.ids import MessageId
+from runner.recording.recording import kind_of
 from runner.view.drawing import Drawing, Views
 
 
+def require(module: str, what: str, extra: str) -> None:
+    """Raises Refused where ``what`` is not installed, a module that comes with an extra."""
+    if find_spec(module) is None:
+        raise Refused(f"{what} is missing; type: pip install 'scene-programming[{extra}]'")
+
+
 def require_viewer() -> None:
-    """Raises Refused where Rerun, which is an extra, is not installed."""
-    if find_spec("rerun") is None:
-        raise Refused("the viewer is Rerun, which is missing; type: pip install 'scene-programming[view]'")
+    """Raises Refused where Rerun is not installed."""
+    require("rerun", "the viewer is Rerun, which", "view")
 
 
 def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
     """What one message shows; what cannot be drawn is named on stderr and left out."""
-    id = MessageId.of(sealed.id)
     found: list[Drawing] = []
     try:
-        if (kind := graph.outputs_of(id.stage).get(id.port)) is not None:
+        if (kind := kind_of(graph, sealed.id)) is not None:
             found.extend(views.draw(open_envelope(kind, sealed)))
     except Exception as error:  # the rest of the recording is still worth seeing
         reason = str(error).partition("\n")[0]
@@ -37,9 +39,4 @@ def load_views(graph: Graph) -> Views:
     """The views a graph names; raises Refused where it names none or they cannot be loaded."""
     if graph.view is None:
         raise Refused(f"graph {graph.name!r} names no views; valid: a line `view: module:Class` in the graph file")
-    module, _, name = graph.view.partition(":")
-    try:
-        views = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise Refused(f"view {graph.view!r} of graph {graph.name!r} cannot be loaded: {error}") from None
-    return cast("Views", views({name: node_entry(node)["config"] for name, node in graph.nodes.items()}))
+    return graph.load("view", graph.view)

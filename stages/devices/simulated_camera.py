@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import inverse
 from stages.messages import Snapshot
 from stages.messages.arrays import Depth, Mask, Rgb
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
@@ -48,13 +49,12 @@ class SimulatedCamera:
         if errors is None:
             items = self._items(snapshot, snapshot.joint_positions)
             camera = Camera(self._K, T_base_camera)
-            rgb = self._renderer.color(items, camera, lighting=_ROOM_LIGHT, background=_SKY)
-            return rgb, self._renderer.depth(items, camera)
+            return self._color(items, camera), self._depth(items, camera)
         positions = snapshot.joint_positions + errors.joints
         items = self._items(snapshot, positions)
         T_base_color = self._robot.camera_pose(snapshot.joint_names, positions) @ errors.T_believed_true
-        rgb = self._renderer.color(items, Camera(self._K, T_base_color), lighting=_ROOM_LIGHT, background=_SKY)
-        depth = self._renderer.depth(items, Camera(self._K, T_base_color @ errors.T_color_depth))
+        rgb = self._color(items, Camera(self._K, T_base_color))
+        depth = self._depth(items, Camera(self._K, T_base_color @ errors.T_color_depth))
         return np.clip(np.round(rgb * errors.gains), 0, 255).astype(np.uint8), depth * np.float32(errors.depth)
 
     def robot_mask(self, snapshot: Snapshot, T_base_camera: Floats, depth: Depth) -> Mask:
@@ -64,12 +64,23 @@ class SimulatedCamera:
         three pixels for noise at its outline.
         """
         items = self._links(snapshot.joint_names, snapshot.joint_positions)
-        body = self._renderer.depth(items, Camera(self._K, T_base_camera))
+        body = self._depth(items, Camera(self._K, T_base_camera))
         return robot_pixels(body, depth)
 
     def close(self) -> None:
         """Frees the OpenGL context."""
         self._renderer.close()
+
+    def _color(self, items: Sequence[Item], camera: Camera) -> Rgb:
+        shown = self._in_sight(items, camera)
+        return self._renderer.color(shown, camera, lighting=_ROOM_LIGHT, background=_SKY)
+
+    def _depth(self, items: Sequence[Item], camera: Camera) -> Depth:
+        return self._renderer.depth(self._in_sight(items, camera), camera)
+
+    def _in_sight(self, items: Sequence[Item], camera: Camera) -> list[Item]:
+        """Without what lies beside the image: a robot's meshes are large, and at home most are not seen."""
+        return [item for item in items if _may_be_seen(item, camera, self._robot.camera.size)]
 
     def _items(self, snapshot: Snapshot, joint_positions: Floats) -> list[Item]:
         poses = zip(snapshot.names, snapshot.T_base_objects, strict=True)
@@ -79,6 +90,16 @@ class SimulatedCamera:
 
     def _links(self, joint_names: Sequence[str], positions: Floats) -> list[Item]:
         return [Item(mesh, T) for mesh, T in self._robot.links(joint_names, positions)]
+
+
+def _may_be_seen(item: Item, camera: Camera, size: tuple[int, int]) -> bool:
+    """False where the item's enclosing box lies wholly behind the camera or beyond one edge of the image."""
+    bounds = np.stack([item.mesh.vertices.min(0), item.mesh.vertices.max(0)])
+    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2], 1.0] for i, j, k in np.ndindex(2, 2, 2)])
+    u, v, z = camera.K @ (inverse(camera.T_world_camera) @ item.T_world_item @ corners.T)[:3]
+    width, height = size
+    beyond = (z < 0, u < -z, u > (width + 1) * z, v < -z, v > (height + 1) * z)
+    return not any(each.all() for each in beyond)
 
 
 def robot_pixels(body: Depth, depth: Depth) -> Mask:

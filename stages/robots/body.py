@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from runner.contract import Refused
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.scene.catalogue import Mesh
@@ -23,7 +24,10 @@ class Body:
     """Forward kinematics and shapes of the links of a specification."""
 
     def __init__(self, specification: mujoco.MjSpec) -> None:
-        self._model: Any = specification.compile()
+        try:
+            self._model: Any = specification.compile()
+        except ValueError as error:
+            raise Refused(f"robot: MuJoCo cannot build the model with what is only seen: {error}") from error
         self._data: Any = mujoco.MjData(self._model)
 
     def link_poses(self, joint_names: Sequence[str], positions: Floats) -> dict[str, Floats]:

@@ -242,8 +242,17 @@ def _check(root: Section, robot: Robot) -> None:
     if robot.camera.link:
         _known(root.section("camera"), (robot.camera.link,), links, "link")
     _known(root, (name for pair in robot.model.touching for name in pair), links, "touching")
+    driven = {actuator.target for actuator in spec.actuators} | set(robot.model.servos)
+    for name in robot.posture.keys() - driven:
+        root.refuse(f"the model has no actuator for '{name}'; give it a servo", "joints")
+    if not robot.model.finger_servo and not driven - set(robot.posture):
+        gripper.refuse("the model has no actuator for the fingers; give them a servo")
     for kind, valid in zip(_KINDS, (links, joints, geoms), strict=True):
         _known(root, robot.model.changed.get(kind, ()), valid, "change")
+    try:
+        robot.specification(seen=False).compile()
+    except ValueError as error:
+        root.refuse(f"MuJoCo cannot build it: {error}", "model")
 
 
 def _known(section: Section, names: Iterable[str], valid: list[str], key: str = "") -> None:

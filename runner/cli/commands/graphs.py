@@ -9,9 +9,12 @@ import json
 from typing import TYPE_CHECKING
 
 from runner.cli.commands import Commands, add, add_graph, add_recordings
+from runner.terminal import Terminal
 
 if TYPE_CHECKING:
     from runner.graph.document import Document
+    from runner.hosts.head import Dismiss
+    from runner.supervise.guardian import End
 
 
 def add_commands(commands: Commands) -> None:
@@ -38,6 +41,7 @@ def add_commands(commands: Commands) -> None:
 
 def _up(options: argparse.Namespace) -> int:
     from runner.graph.document import read_document
+    from runner.graph.placement import refuse_settings
     from runner.process.forks import become_clean
     from runner.view.views import require_viewer
 
@@ -50,20 +54,21 @@ def _up(options: argparse.Namespace) -> int:
         document.set(setting)
     host = None if options.here else _other_host(options, document)
     if host is not None:
-        return _take_part(options, document, host)
+        refuse_settings(options.settings, host)
     become_clean("runner.cli", *options.arguments)
-    return _supervise(options)
+    terminal = Terminal(verbose=options.verbose)
+    end = _supervise(options, terminal) if host is None else _take_part(options, document, host, terminal)
+    terminal.plain(end.reason)
+    return end.code
 
 
-def _supervise(options: argparse.Namespace) -> int:
+def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
     """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
     from runner.graph.graph import SUPERVISOR, load_graph
     from runner.page.start import page_beside, require_page
     from runner.process.fork_server import ForkServer
     from runner.supervise.supervisor import Supervisor
-    from runner.terminal import Terminal
 
-    terminal = Terminal(verbose=options.verbose)
     gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, options.settings)
     if options.page or graph.page:
@@ -79,9 +84,7 @@ def _supervise(options: argparse.Namespace) -> int:
         steps_only=options.steps_only,
     )
     with page_beside(supervisor.id) if options.page or graph.page else contextlib.nullcontext():
-        end = supervisor.run(view=options.view)
-    terminal.plain(end.reason)
-    return end.code
+        return supervisor.run(view=options.view)
 
 
 def _other_host(options: argparse.Namespace, document: Document) -> str | None:
@@ -93,19 +96,12 @@ def _other_host(options: argparse.Namespace, document: Document) -> str | None:
     return None if not layout.hosts or chosen == layout.head.name else chosen
 
 
-def _take_part(options: argparse.Namespace, document: Document, host: str) -> int:
-    from runner.hosts.agent import Agent, refuse_settings
+def _take_part(options: argparse.Namespace, document: Document, host: str, terminal: Terminal) -> Dismiss:
+    from runner.hosts.agent import Agent
     from runner.process.fork_server import ForkServer
-    from runner.process.forks import become_clean
-    from runner.terminal import Terminal
 
-    refuse_settings(options.settings, host)
-    become_clean("runner.cli", *options.arguments)
-    terminal = Terminal(verbose=options.verbose)
     forks = ForkServer(lambda text: terminal.show(host, text, "warning"))
-    end = Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
-    terminal.plain(end.reason)
-    return end.code
+    return Agent(document, host, recordings=options.recordings, terminal=terminal, forks=forks).run()
 
 
 def _check(options: argparse.Namespace) -> None:

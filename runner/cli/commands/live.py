@@ -87,7 +87,7 @@ def _ps(options: argparse.Namespace) -> None:
     for number, entry in enumerate(entries):
         try:
             with Live(entry) as live:
-                text = status_text(live.status())
+                text = status_text(entry, live.status())
         except Refused as refusal:  # it has just ended, or it hangs
             text = str(refusal)
         print("\n" * (number > 0) + text)
@@ -169,14 +169,12 @@ def _goals(options: argparse.Namespace) -> None:
         raise Refused(f"{options.name}: is not remembered{suggest(options.name, titles)}")
     for card in told.cards:
         if options.name in (None, card.title):
-            calls = (f"runner call {one.stage} {one.command} {_typed(one.arguments)}" for one in card.actions)
-            print(card.title, *(f"    {line}" for line in (card.text, *calls)), sep="\n")
+            print(card.title, f"    {card.text}", sep="\n")
+            for one in card.actions:
+                typed = (f"{name}={shlex.quote(value)}" for name, value in one.arguments.items())
+                print("   ", "runner call", one.stage, one.command, *typed)
     if not told.cards:
         print(told.cards_hint or "this graph remembers nothing")
-
-
-def _typed(arguments: dict[str, str]) -> str:
-    return " ".join(f"{name}={shlex.quote(value)}" for name, value in arguments.items())
 
 
 def _page(options: argparse.Namespace) -> None:

@@ -96,6 +96,9 @@ def _export(options: argparse.Namespace) -> None:
 
         print(*export_bag(options.file, options.ros2), sep="\n")
         return
+    from runner.view.views import require
+
+    require("foxglove", "runner export: the Foxglove SDK", "foxglove")
     from runner.view.export import export
 
     if options.foxglove.suffix != ".mcap":

@@ -3,7 +3,7 @@
 import argparse
 import os
 
-from runner.cli.commands import Command, Commands, add, add_file, add_settings, count
+from runner.cli.commands import Commands, add, add_file, add_settings, count
 from runner.contract import Refused
 
 _EPILOG = """\
@@ -25,7 +25,8 @@ def add_commands(commands: Commands) -> None:
     text = "execute this stage and what follows from it, changed or not; may be given again"
     replay.add_argument("--from", action="append", default=[], metavar="STAGE", dest="origins", help=text)
     replay.add_argument("--verify", action="store_true", help="compare every message byte for byte")
-    replay.add_argument("--workers", type=count, metavar="N", help="stages executed at the same time (one a core)")
+    text, cores = "stages executed at the same time (one a core)", len(os.sched_getaffinity(0))
+    replay.add_argument("--workers", type=count, metavar="N", default=cores, help=text)
     replay.add_argument("--until", metavar="ID", help="stop at this message, for example ranker.scene_estimate#3")
     text = "stop at the first message for which this holds, for example 'ranker.scene_estimate.winner > 0'"
     replay.add_argument("--break", metavar="EXPRESSION", dest="condition", help=text)
@@ -34,30 +35,26 @@ def add_commands(commands: Commands) -> None:
     replay.add_argument("--prompt", action="store_true", help="open a Python prompt where it stops, terminal or not")
 
 
-def _replay(options: argparse.Namespace) -> int | None:
+def _replay(options: argparse.Namespace) -> int:
     """Only saying what would be executed needs no clean process."""
-    if options.until or options.condition or options.step:
-        return _in_clean_process(options, _travel)
-    if options.swaps or options.origins or (options.settings and not options.verify):
-        return _in_clean_process(options, _what_if)
-    if options.verify:
-        return _in_clean_process(options, _verify)
-    from runner.replay.replay import plan
+    travels = options.until or options.condition or options.step
+    changes = options.swaps or options.origins or (options.settings and not options.verify)
+    if not (travels or changes or options.verify):
+        from runner.replay.replay import plan
 
-    print(*plan(options.file), sep="\n")
-    return None
+        print(*plan(options.file), sep="\n")
+        return 0
+    if options.verify and travels:
+        raise Refused("--verify goes through the whole recording; it does not stop with --until, --break or --step")
+    if options.until and options.condition:
+        raise Refused("--until and --break each say where to stop; give one")
+    if options.verify and changes:
+        raise Refused("--verify compares the recording as it is; valid with --from or --swap: nothing else")
+    from runner.process.forks import become_clean
 
-
-def _in_clean_process(options: argparse.Namespace, command: Command) -> int | None:
-    """Libraries read their thread counts once, when they are imported: executes in an interpreter that says 1."""
-    from runner.process.children import PARENT, die_with_parent
-    from runner.process.forks import call_clean, is_clean
-
-    if is_clean():
-        if PARENT in os.environ:
-            die_with_parent()
-        return command(options)
-    return call_clean("runner.cli", *options.arguments)
+    become_clean("runner.cli", *options.arguments)
+    execute = _travel if travels else _what_if if changes else _verify
+    return execute(options)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -69,8 +66,6 @@ def _verify(options: argparse.Namespace) -> int:
 def _what_if(options: argparse.Namespace) -> int:
     from runner.replay.whatif import what_if
 
-    if options.verify:
-        raise Refused("--verify compares the recording as it is; valid with --from or --swap: nothing else")
     return what_if(
         options.file,
         assignments=options.settings,
@@ -83,10 +78,6 @@ def _what_if(options: argparse.Namespace) -> int:
 def _travel(options: argparse.Namespace) -> int:
     from runner.replay.travel import travel
 
-    if options.verify:
-        raise Refused("--verify goes through the whole recording; it does not stop with --until, --break or --step")
-    if options.until and options.condition:
-        raise Refused("--until and --break each say where to stop; give one")
     return travel(
         options.file,
         assignments=options.settings,

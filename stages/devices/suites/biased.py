@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.devices.suites.draft import Draft
-from stages.devices.suites.suite import Drawn, Kind, graspable, put_somewhere
+from stages.devices.suites.suite import Drawn, Kind, graspable, put_somewhere, shift
 from stages.devices.suites.wild import FIXED
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose
@@ -29,12 +29,12 @@ class Biased(Drawn):
         """The objects, the table and what is wrong."""
         fixed = [FIXED[0]] if rng.random() < 0.5 else []
         self.names = (*fixed, *rng.permutation(graspable(self.catalogue)).tolist()[: int(rng.integers(5, 8))])
-        x, height = self.table.center[0] - 0.80, self.table.height - 0.70
+        dx, _, dz = shift(self.robot).tolist()
         depth, front = float(rng.uniform(0.55, 0.85)), float(rng.uniform(0.40, 0.48))
         self.table = Table(
-            center=(x + front + depth / 2, float(rng.uniform(-0.05, 0.05))),
+            center=(dx + front + depth / 2, float(rng.uniform(-0.05, 0.05))),
             size=(depth, float(rng.uniform(1.0, 1.4))),
-            height=height + float(rng.uniform(0.66, 0.74)),
+            height=dz + float(rng.uniform(0.66, 0.74)),
         )
         self._depth = 1 + float(rng.choice((-1, 1)) * rng.uniform(*_DEPTH))
         self._T_believed_true = pose(exp_so3(_EXTRINSICS[1] * _direction(rng)), _EXTRINSICS[0] * _direction(rng))

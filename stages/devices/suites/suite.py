@@ -12,11 +12,16 @@ import numpy as np
 from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.tabletop import HIDDEN, Layout
+from stages.geometry.arrays import Floats
 from stages.messages import SensorErrors
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
 
 Kind = Literal["goal", "start"]
+
+
+_MIDDLE = (0.80, 0.0, 0.70)
+"""Where the numbers of the suites have the middle of the table, in the base frame, metres."""
 
 
 class Rejected(Exception):
@@ -85,6 +90,11 @@ class Drawn(Suite):
         if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
         return draft.layout
+
+
+def shift(robot: Robot) -> Floats:
+    """How far the middle of the robot's table is from there, x y z, metres."""
+    return np.subtract((*robot.table.center, robot.table.height), _MIDDLE)
 
 
 def graspable(catalogue: Catalogue) -> list[str]:

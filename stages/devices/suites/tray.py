@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.devices.suites.placing import support_height, upright
-from stages.devices.suites.suite import Kind, Suite
+from stages.devices.suites.suite import Kind, Suite, shift
 from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
@@ -19,10 +19,8 @@ from stages.scene.catalogue import Catalogue, CatalogueObject
 
 TRAY = "tray"
 
-_MIDDLE = (0.80, 0.0)
-"""The scenes are written for a table whose middle is here, and shifted to where the robot's is; metres."""
 _NEAR, _FAR = 0.52, 0.80
-"""Between these objects stand."""
+"""Metres ahead between which objects stand."""
 _APART = 0.04
 """Metres between objects that are not placed together: room for a finger."""
 _STACKED_SHARE = 0.3
@@ -214,12 +212,8 @@ def _free_pose(entry: CatalogueObject, robot: Robot, rng: np.random.Generator) -
 
 
 def _on_table(entry: CatalogueObject, x: float, y: float, yaw: float, robot: Robot) -> Floats:
-    dx, dy = _shift(robot)
+    dx, dy, _ = shift(robot)
     return upright(entry, x + dx, y + dy, yaw, robot.table.height)
-
-
-def _shift(robot: Robot) -> Floats:
-    return np.subtract(robot.table.center, _MIDDLE)
 
 
 def _spot_pose(spot: Spot, layout: Layout, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Floats:
@@ -254,7 +248,7 @@ def _is_good(
 
 
 def _reachable(T: Floats, robot: Robot) -> bool:
-    x = T[0, 3] - _shift(robot)[0]
+    x = T[0, 3] - shift(robot)[0]
     return bool(np.linalg.norm(T[:2, 3] - robot.shoulder) <= robot.reach and _NEAR <= x <= _FAR)
 
 

@@ -180,7 +180,7 @@ def test_a_run_says_how_its_processes_are(account: Run) -> None:
         status = live.status()
     assert [process.name for process in status.processes] == ["recorder", "counter", "account"]
     assert {process.state for process in status.processes} <= {"waiting", "working", "held back"}
-    assert status.recording == account.entry.recording
+    assert status.endpoint == account.entry.gateway
     number = next(topic for topic in status.topics if topic.topic == "counter/number")
     assert (number.type, number.consumers) == ("Number", ("account.number",))
 

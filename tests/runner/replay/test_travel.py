@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from runner.cli.main import main
-from runner.process.children import ENVIRONMENT
+from runner.process.forks import clean_environment
 from tests.runner.common.recordings import record_toys
 
 
@@ -20,7 +20,7 @@ def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is forked here: this process will do."""
-    for name, value in ENVIRONMENT.items():
+    for name, value in clean_environment().items():
         monkeypatch.setenv(name, value)
 
 

@@ -12,7 +12,7 @@ from runner.cli.main import main
 from runner.contract import Message
 from runner.graph.graph import load_graph
 from runner.message.codec import decode
-from runner.process.children import ENVIRONMENT
+from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
 from tests.runner.common.recordings import ToyRun, record, record_toys
 from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Total
@@ -215,7 +215,7 @@ def test_another_seed_executes_everything(toys: Path):
 def test_what_is_impossible_is_refused_with_what_is_valid(
     toys: Path, arguments: list[str], error: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    for name, value in ENVIRONMENT.items():
+    for name, value in clean_environment().items():
         monkeypatch.setenv(name, value)  # nothing is executed: this process will do
     assert main(["replay", str(toys), *arguments]) == 2
     assert error in capsys.readouterr().err

@@ -13,7 +13,7 @@ from runner.graph.placement import Credentials, Host, Network
 from runner.hosts.keys import add_keys, credentials, make_keys
 from runner.message.packet import Process
 from runner.transport.bus import Bus
-from runner.transport.session import Gateway, Router, new_endpoint
+from runner.transport.session import Gateway, new_endpoint, open_session
 from tests.runner.common.waiting import wait_until
 
 NAMES = ("head", "worker1", "worker2")
@@ -58,7 +58,7 @@ def table(keys: Path, request: pytest.FixtureRequest) -> Iterator[Table]:
     own, other = (
         Network(name, "head", NAMES, "tls/127.0.0.1:0", routed, credentials(keys, name)) for name in NAMES[:2]
     )
-    router = [Router(endpoint, own)] if routed else []
+    router = [open_session([endpoint], [], own, mode="router")] if routed else []
     head = Bus("run", endpoint, network=own, process=Process("counter", 0), listen=not routed)
     made = Table(endpoint, head, Bus("run", endpoint, network=other))
     made.worker.subscribe("**", lambda packet: made.arrived.append((packet.key, packet.payload)))

@@ -106,10 +106,11 @@ def test_a_turned_place_frames_what_is_drawn_before_it_and_all_below_is_cleared(
         d.Boxes2D("world/a/b", BOXES),
     ]
     with path.open("wb") as file:
-        sink = _Sink(Writer(file))
+        writer = Writer(file)
+        sink = _Sink(writer)
         for time_ns, step in enumerate((drawings, [d.Clear("world/a")], [d.Clear("world/a")])):
             sink.put(scribe.written(step, time_ns), time_ns)
-        sink.finish()
+        writer.finish()
     (place,), clouds, boxes = (read(path, topic) for topic in ("/tf", "/world/a/points", "/world/a/b"))
     assert [*vector(place.rotation), place.rotation.w] == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)])
     assert [cloud.frame_id for cloud in clouds] == ["world/a", "world/a"]

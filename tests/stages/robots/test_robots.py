@@ -78,6 +78,18 @@ def test_the_torso_carries_the_camera() -> None:
         ("velocity: 0.10,", "", r"joints\.torso_lift_joint: the key 'velocity' is missing"),
         ("x: [0.45, 0.80]", "x: [0.8, 0.4]", r"workspace\.x: \[0\.8, 0\.4\] is not \[lowest, highest\]"),
         ("fetch/robot.xml", "fetch/robots.xml", r"MuJoCo cannot read the model: .*robots\.xml"),
+        ("still:", "touching: []\nstill:", r"the key 'touching' stands there twice"),
+        (
+            "servo: {kp: 1500, kv: 120, effort: 66.2, armature: 0.3}",
+            "",
+            r"no actuator for 'elbow_flex_joint'; give it a servo",
+        ),
+        (
+            "  servo: {kp: 2000, kv: 200, effort: 60, armature: 0.5, damping: 5.0}",
+            "",
+            r"gripper: the model has no actuator",
+        ),
+        ('meshdir="stls/fetch"', 'meshdir="stl"', r"model: MuJoCo cannot build it: .*stl/"),
         ("touching:", "touch:", r"touch: unknown key; valid are model, remove"),
     ],
 )
@@ -86,6 +98,14 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path
     file.write_text((FOLDER / "fetch.yaml").read_text().replace(old, new, 1))
     with pytest.raises(Refused, match=message):
         read_robot(file)
+
+
+def test_a_description_may_be_like_another(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(f"like: {FOLDER}/ur5e.yaml\nfloor: -0.9\n")
+    robot, other = read_robot(file), read_robot(FOLDER / "ur5e.yaml")
+    assert (robot.floor, other.floor) == (-0.9, -0.7)
+    assert robot.posture == other.posture
 
 
 def test_a_description_is_tried_before_it_is_used() -> None:
