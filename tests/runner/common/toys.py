@@ -222,13 +222,14 @@ class Walker(Stage):
 
     def on_number(self, number: Number, ctx: Context) -> Iterator[Finished | None]:
         walked = 0
+        ctx.log("walks")
         try:
             while not self._goal:
                 time.sleep(0.01)
                 walked += 1
                 yield None
         except GeneratorExit:
-            ctx.log(f"stands after {walked} steps" if walked else "has not begun")
+            ctx.log(f"stands after {walked} steps")
             raise
         yield Finished(code=0, reason=f"arrived at {self._goal} after {walked} steps")
 
