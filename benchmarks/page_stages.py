@@ -45,6 +45,9 @@ class PictureStory:
         assert isinstance(heard.message, Picture)
         self._photo = Photo(str(heard.time_ns), heard.message.rgb)
 
+    def recall(self) -> None:
+        """Nothing is kept."""
+
     def tell(self, language: Language) -> Told:
         """The picture."""
         turns = np.linspace(0, 2 * np.pi, 40)

@@ -15,8 +15,8 @@ from stages.messages import (
     Arrangement,
     Asked,
     Assertion,
-    Forget,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Observation,
@@ -37,6 +37,7 @@ from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
 from stages.planning.pddl import goal_pddl
 from stages.scene.catalogue import Catalogue
+from stages.scene.goals import check_name
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import Stances, standing_of
 from stages.scene.virtual import satisfied
@@ -133,7 +134,7 @@ class Demonstrator(Stage):
             ):
                 if getattr(self, name) < least:
                     raise Refused(f"demonstrator.{name}={getattr(self, name)}: must be {least} or more")
-            _refuse_odd_name(f"demonstrator.goal_name={self.goal_name!r}", self.goal_name)
+            check_name(f"demonstrator.goal_name={self.goal_name!r}", self.goal_name)
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -150,7 +151,7 @@ class Demonstrator(Stage):
 
     def on_teach(self, teach: Teach, ctx: Context) -> LookRequest:
         """Looks at what is to be remembered."""
-        _refuse_odd_name(f"name={teach.name!r}", teach.name)
+        check_name(f"name={teach.name!r}", teach.name)
         self._begin(teach.name, None)
         ctx.log(f'looks at the goal "{teach.name}"')
         return self._look(f"goal {teach.name}")
@@ -160,13 +161,6 @@ class Demonstrator(Stage):
         self._begin(restore.name, self._goal(restore.name))
         ctx.log(f'restores the goal "{restore.name}"')
         return self._look(f"restore {restore.name}")
-
-    def on_forget(self, forget: Forget, ctx: Context) -> None:
-        """Strikes a goal off; one that is being restored still is."""
-        self._goal(forget.name)
-        goals = {name: goal for name, goal in self._state.goals.items() if name != forget.name}
-        self._state = replace(self._state, goals=goals)
-        ctx.log(f'goal "{forget.name}" forgotten')
 
     def on_look(self, look: Look, ctx: Context) -> LookRequest:
         """Looks without a goal."""
@@ -373,7 +367,15 @@ class Demonstrator(Stage):
         )
 
 
-class AskedDemonstrator(Demonstrator):
+class KeepingDemonstrator(Demonstrator):
+    """Knows the goals that are on disk, too."""
+
+    def on_kept(self, kept: Kept) -> None:
+        """Goals were read, or changed; one that is being restored stays as it is."""
+        self._state = replace(self._state, goals={goal.name: goal.scene for goal in kept.goals})
+
+
+class AskedDemonstrator(KeepingDemonstrator):
     """Does what a device is asked from outside as well as what is called."""
 
     def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Verdict:
@@ -395,12 +397,6 @@ class AskedDemonstrator(Demonstrator):
 
 def _names(scene: SceneGraph) -> set[str]:
     return {item.name for item in scene.objects}
-
-
-def _refuse_odd_name(place: str, name: str) -> None:
-    """Goals are written to files of their names."""
-    if not name.replace("-", "").replace("_", "").isalnum():
-        raise Refused(f"{place}: must consist of letters, digits, - and _ only")
 
 
 def change_of_plan(expected: Sequence[Transfer], planned: Sequence[Transfer]) -> str:

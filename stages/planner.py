@@ -14,7 +14,7 @@ from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning import search
 from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
-from stages.planning.problem import TABLE, Problem, carriers, cycle
+from stages.planning.problem import TABLE, Problem, cycle, wanted
 from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
@@ -167,7 +167,7 @@ class Planner(Stage):
             if solution.steps is None:
                 raise Impossible(_dead_end(attempt.problem, problem))
             again = [step for step in solution.steps if _key(step) in avoided]
-            poses = targets.of(solution.steps, current, carriers(task.goal), again=again, late=attempt.reluctant)
+            poses = targets.of(solution.steps, current, wanted(task.goal), again=again, late=attempt.reluctant)
             if isinstance(poses, Crowded):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
                 continue

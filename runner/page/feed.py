@@ -46,5 +46,5 @@ class Feed:
 
 
 def _shape(array: Any) -> list[int]:
-    """Of pictures only their size is sent: H, W, 3."""
+    """Of pictures and files only their size is sent: H, W, 3, or the number of bytes."""
     return list(array.shape)

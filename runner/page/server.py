@@ -69,6 +69,8 @@ class Page:
         """By every open page."""
         self._photos: dict[str, bytes] = {}
         """JPEG by key."""
+        self._files: dict[str, bytes] = {}
+        """What can be downloaded, by key."""
         self._news, self._looks = asyncio.Event(), asyncio.Event()
         self._ended = threading.Event()
         self._ready = False
@@ -82,6 +84,7 @@ class Page:
             WebSocketRoute("/live", self._show),
             Route("/call", self._call, methods=["POST"]),
             Route("/photo/{key}.jpg", self._photo),
+            Route("/file/{key}", self._file),
             Route("/runs", self._runs),
             Route("/runs/{name}.mcap", self._download),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
@@ -148,6 +151,7 @@ class Page:
             for language in languages:
                 told = await run_in_threadpool(self._watch.tell, language)
                 await run_in_threadpool(self._keep_photos, told.photos)
+                self._files = {file.key: file.data.tobytes() for file in told.files}
                 self._feed.put(f"told {language}", told)
             if self._an_engineer_looks:
                 self._feed.put("log", list(self._watch.lines))
@@ -178,6 +182,12 @@ class Page:
         if jpeg is None:
             return PlainTextResponse("this picture is not kept any more\n", 404)
         return Response(jpeg, media_type="image/jpeg")
+
+    async def _file(self, request: Request) -> Response:
+        data = self._files.get(request.path_params["key"])
+        if data is None:
+            return PlainTextResponse("this file is not kept any more\n", 404)
+        return Response(data, media_type="application/octet-stream")
 
     # ------------------------------------------------------------------------------------------ what is asked
 

@@ -35,6 +35,18 @@ class Photo:
 
 
 @dataclass(frozen=True, slots=True)
+class File:
+    """Something to be downloaded; equal keys are equal files."""
+
+    key: str
+    """Letters, digits, ``.``, ``-`` and ``_``."""
+    name: str
+    label: str
+    data: NDArray[np.uint8]
+    """N bytes."""
+
+
+@dataclass(frozen=True, slots=True)
 class Outline:
     """Something seen in a picture."""
 
@@ -76,6 +88,8 @@ class Ask:
     hint: str = ""
     pattern: str = ""
     """Regular expression that the whole text must match; anything by default."""
+    kind: Literal["text", "file"] = "text"
+    """A file is sent as base64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +110,14 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
+class Line:
+    """One thing that a card says, with what can be done about it."""
+
+    text: str
+    actions: tuple[Action, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Card:
     """Something that is kept, with what can be done with it."""
 
@@ -104,6 +126,12 @@ class Card:
     text: str
     photo: Photo | None
     actions: tuple[Action, ...]
+    more: tuple[Action, ...] = ()
+    """What is done less often."""
+    lines: tuple[Line, ...] = ()
+    """What it holds, one by one."""
+    lines_title: str = ""
+    file: File | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,12 +202,19 @@ class Told:
     cards_hint: str = ""
     """Shown where there are no cards."""
     cards: tuple[Card, ...] = ()
+    cards_actions: tuple[Action, ...] = ()
+    """What can be done to have one more."""
 
     @property
     def photos(self) -> list[Photo]:
         """All pictures that are told of."""
         found = [card.photo for card in self.cards] + [self.view.photo if self.view else None]
         return [photo for photo in found if photo is not None]
+
+    @property
+    def files(self) -> list[File]:
+        """All files that are told of."""
+        return [card.file for card in self.cards if card.file is not None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +241,10 @@ class Story(Protocol):
 
     def hear(self, heard: Heard) -> None:
         """Takes a message, in recorded order."""
+        ...
+
+    def recall(self) -> None:
+        """Takes what is kept beyond runs, where there is no run to hear it from."""
         ...
 
     def tell(self, language: Language) -> Told:

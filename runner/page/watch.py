@@ -25,6 +25,8 @@ from runner.recording.recording import LOG, RUN
 
 KEPT_LINES = 300
 """Log lines that a page shows."""
+NOTHING = Told(Doing(""))
+"""What is told of a graph that names nobody to tell its story."""
 
 
 class Watch:
@@ -54,7 +56,7 @@ class Watch:
     def tell(self, language: Language) -> Told:
         """What there is to say now."""
         with self._telling:
-            return self._story.tell(language) if self._story else Told(Doing(""))
+            return self._story.tell(language) if self._story else NOTHING
 
     def read(self) -> None:
         """Reads until the run ends, or as far as it is there once it is to stop."""
@@ -113,3 +115,12 @@ def told_so_far(recording: Path, language: Language) -> Told:
     watch.look(True)
     watch.read()
     return watch.tell(language)
+
+
+def told_without_a_run(graph: Graph, language: Language) -> Told:
+    """What there is to say of what a graph keeps beyond its runs."""
+    story = load_story(graph)
+    if story is None:
+        return NOTHING
+    story.recall()
+    return story.tell(language)

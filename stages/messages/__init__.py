@@ -8,6 +8,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
+from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
 from stages.messages.robot import RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
@@ -15,7 +16,6 @@ from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
 from stages.messages.task import (
     Arrange,
     Arrangement,
-    Forget,
     Goal,
     Look,
     Move,
@@ -31,6 +31,7 @@ from stages.messages.task import (
 )
 
 __all__ = [
+    "Add",
     "Arrange",
     "Arrangement",
     "Asked",
@@ -44,8 +45,10 @@ __all__ = [
     "Goal",
     "Hypothesis",
     "Intrinsics",
+    "Kept",
     "Look",
     "LookRequest",
+    "Loosen",
     "Mask",
     "Move",
     "ObjectPose",
@@ -56,6 +59,7 @@ __all__ = [
     "Pose",
     "Poses",
     "Posterior",
+    "Rename",
     "Restore",
     "Rgb",
     "RobotCommand",
@@ -67,6 +71,7 @@ __all__ = [
     "SensorErrors",
     "Snapshot",
     "Stop",
+    "Strike",
     "Task",
     "Teach",
     "Transfer",

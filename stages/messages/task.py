@@ -25,6 +25,8 @@ class Goal(Message, frozen=True, kw_only=True):
     scene: SceneGraph
     pddl: str
     """The goal as a PDDL problem fragment; pose labels are tied to poses in comments."""
+    picture: bytes = b""
+    """JPEG of the look at which it was shown, from where goals are kept; empty where nobody keeps it."""
 
 
 class Task(Message, frozen=True, kw_only=True):
@@ -125,13 +127,6 @@ class Restore(Command, frozen=True, kw_only=True):
     """Looks, plans and acts until the goal of that name holds or cannot be reached."""
 
     answers = (Verdict,)
-
-    name: str
-    """Of a goal that was taught."""
-
-
-class Forget(Command, frozen=True, kw_only=True):
-    """Forgets the goal of that name."""
 
     name: str
     """Of a goal that was taught."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from runner.contract import Message, Refused
 from runner.page.story import (
@@ -15,8 +19,10 @@ from runner.page.story import (
     Ask,
     Card,
     Doing,
+    File,
     Heard,
     Language,
+    Line,
     Map,
     Notice,
     Photo,
@@ -28,9 +34,10 @@ from runner.page.story import (
 from stages.messages import (
     Arrange,
     Arrangement,
-    Forget,
+    Assertion,
     Frame,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Move,
@@ -50,12 +57,15 @@ from stages.messages import (
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import Catalogue
+from stages.scene.goals import MAX_RADIUS, GoalFolder, packed
 from stages.scene.text import support
 from stages.story.outlines import footprint, ground, how_sure, outlines, region_name, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, WORLD = "demonstrator", "world"
+DEMONSTRATOR, WORLD, GOALS = "demonstrator", "world", "goals"
 """Stages that take commands, as our graphs call them."""
+WIDER = 0.04
+"""Metres by which a region grows when somebody loosens it."""
 NAME = r"[\p{L}\p{N}_\-]+"
 """What the name of a goal may be."""
 SHOWN_FAULTS = 4
@@ -82,17 +92,31 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """A goal, and the picture in which it was shown."""
+    """A goal, the picture in which it was shown, and itself as a file."""
 
     goal: Goal
     photo: Photo | None
+    file: NDArray[np.uint8] | None = None
+    """None where goals are not kept."""
+
+    @staticmethod
+    def of(goal: Goal) -> Remembered:
+        """One that is kept."""
+        file = np.frombuffer(packed(goal), np.uint8)
+        bgr = cv2.imdecode(np.frombuffer(goal.picture, np.uint8), cv2.IMREAD_COLOR) if goal.picture else None
+        photo = (
+            None
+            if bgr is None
+            else Photo(_key(goal.picture), np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+        )
+        return Remembered(goal, photo, file)
 
 
 class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
     hears: tuple[type[Message], ...] = (
-        *(Teach, Restore, Forget, Look, Stop, Arrange, Arrangement, Move),
+        *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, Kept),
         *(LookRequest, Frame, SceneEstimate, SceneGraph),
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
     )
@@ -105,6 +129,7 @@ class Story:
         self._catalogue = Catalogue.load(Path(paths[0]))
         self._commanded = DEMONSTRATOR in configs and not configs[DEMONSTRATOR].get("scripted", True)
         self._simulated = WORLD in configs
+        self._folder = Path(configs[GOALS]["folder"]) if GOALS in configs else None
         self._asked: dict[str, Teach | Restore | Look] = {}
         """Commands by id, until the stage takes them up."""
         self._caused_look: tuple[str, ...] = ()
@@ -145,8 +170,8 @@ class Story:
             case Arrange() | Arrangement() as arranged:
                 self._moved, self._scene = True, None
                 self._draws += arranged.kind == "start"
-            case Forget(name=name):
-                self._goals.pop(name, None)
+            case Kept(goals=goals):
+                self._keep(goals)
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
             case _:
@@ -213,6 +238,14 @@ class Story:
             self._goals[end.name] = Remembered(end, self._photo)
         self._ended, self._job = (end, id), None
 
+    def recall(self) -> None:
+        """Takes the goals that are on disk."""
+        if self._folder is not None:
+            self._keep(tuple(GoalFolder(self._folder).read()[0].values()))
+
+    def _keep(self, goals: tuple[Goal, ...]) -> None:
+        self._goals = {goal.name: Remembered.of(goal) for goal in goals}
+
     # ------------------------------------------------------------------------------------------ what is told
 
     def tell(self, language: Language) -> Told:
@@ -228,6 +261,7 @@ class Story:
             cards_title=words.say("goals"),
             cards_hint=words.say("no_goals"),
             cards=tuple(self._card(name, kept, words) for name, kept in self._goals.items()),
+            cards_actions=(_add(words),) if self._folder else (),
         )
 
     def _doing(self, words: Words) -> Doing:
@@ -310,9 +344,17 @@ class Story:
         restore = Action(
             DEMONSTRATOR, "restore", words.say("do_restore"), {"name": name}, kind="first", now=self._job is None
         )
-        sure = words.say("forget_sure", name=name)
-        forget = Action(DEMONSTRATOR, "forget", words.say("do_forget"), {"name": name}, confirm=sure)
-        return Card(name, name, text, kept.photo, (restore, forget) if self._commanded else ())
+        return Card(
+            name,
+            name,
+            text,
+            kept.photo,
+            (restore,) if self._commanded else (),
+            more=tuple(_kept_actions(name, words)) if kept.file is not None else (),
+            lines=tuple(_lines(kept.goal, words)) if kept.file is not None else (),
+            lines_title=words.say("matters"),
+            file=_file(name, kept.file, words) if kept.file is not None else None,
+        )
 
     # ------------------------------------------------------------------------------------------ how it ended
 
@@ -345,6 +387,53 @@ class Story:
                 parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
                 found.append(words.say("should_beside", **parts))
         return found[:SHOWN_FAULTS]
+
+
+def _kept_actions(name: str, words: Words) -> Iterator[Action]:
+    """What can be done with a goal on disk."""
+    ask = Ask("to", words.say("new_name"), words.say("name_hint"), NAME)
+    yield Action(GOALS, "rename", words.say("do_rename"), {"name": name}, ask)
+    yield Action(GOALS, "forget", words.say("do_forget"), {"name": name}, confirm=words.say("forget_sure", name=name))
+
+
+def _add(words: Words) -> Action:
+    return Action(GOALS, "add", words.say("do_add"), {}, Ask("file", words.say("add_file"), kind="file"))
+
+
+def _file(name: str, data: NDArray[np.uint8], words: Words) -> File:
+    return File(_key(data.tobytes()), f"{name}.zip", words.say("do_export"), data)
+
+
+def _key(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def _lines(goal: Goal, words: Words) -> Iterator[Line]:
+    """What a goal asks for, and how to ask for less."""
+    scene, carried = goal.scene, {item.arguments[0]: item for item in goal.scene.assertions if _carries(item)}
+
+    def strike(what: str, label: str) -> Action:
+        return Action(GOALS, "strike", label, {"name": goal.name, "what": what})
+
+    for item in scene.objects:
+        noun, found = words.noun(item.name), carried.get(item.name)
+        text = words.say("anywhere", object=noun)
+        if found is not None:
+            text = words.say(f"is_{found.predicate}", child=noun, supporter=words.noun(found.arguments[1]))
+        loose = () if found is None else (strike(str(found), words.say("do_strike")),)
+        out = (strike(item.name, words.say("do_leave_out", object=noun)),) if len(scene.objects) > 1 else ()
+        yield Line(f"{text}.", (*loose, *out))
+    for region in scene.virtual_objects:
+        parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
+        text = words.say("is_beside", **parts, off=round(100 * region.radius))
+        radius = min(region.radius + WIDER, MAX_RADIUS)
+        wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
+        loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
+        yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+
+
+def _carries(item: Assertion) -> bool:
+    return item.predicate in ("on", "in")
 
 
 def _statement(text: str, name: str, item: ObjectPose | None, words: Words) -> Statement:

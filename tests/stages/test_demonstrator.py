@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from runner.contract import Message, Refused
-from stages.demonstrator import Demonstrator, change_of_plan
+from stages.demonstrator import Demonstrator, KeepingDemonstrator, change_of_plan
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
     Arrangement,
-    Forget,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Observation,
@@ -86,7 +86,7 @@ class Episode:
         ending = msgspec.structs.replace(outcome(number, item, **fields), T_base_object=at)
         return self.take(self.stage.on_outcome(ending, self.ctx))
 
-    def called(self, command: Teach | Restore | Forget | Look | Stop) -> list[Message]:
+    def called(self, command: Teach | Restore | Look | Stop) -> list[Message]:
         handler = getattr(self.stage, f"on_{type(command).__name__.lower()}")
         return self.take(handler(command, self.ctx))
 
@@ -398,15 +398,19 @@ def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -
         assert episode.seen(GOAL) == []
 
 
-def test_a_goal_that_is_forgotten_cannot_be_restored() -> None:
+def test_what_is_kept_on_disk_can_be_restored_and_what_was_deleted_cannot() -> None:
     episode = Episode(scripted=False)
-    for name in ("tea", "mess"):
-        episode.called(Teach(name=name))
-        episode.seen(GOAL)
-    assert episode.called(Forget(name="tea")) == []
-    for command in (Restore(name="tea"), Forget(name="tea")):
-        with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
-            episode.called(command)
+    keeping = KeepingDemonstrator(Demonstrator.Config(catalogue=CATALOGUE, scripted=False))
+    episode.stage = keeping
+    keeping.on_kept(Kept(goals=(Goal(name="tea", scene=GOAL, pddl=""), Goal(name="mess", scene=START, pddl=""))))
+    assert episode.called(Restore(name="tea")) == [LookRequest(purpose="restore tea")]
+    keeping.on_kept(Kept(goals=(Goal(name="mess", scene=START, pddl=""),)))
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.goal is GOAL
+    episode.called(Stop())
+    episode.planned(STEP)
+    with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
+        episode.called(Restore(name="tea"))
     assert episode.called(Restore(name="mess")) == [LookRequest(purpose="restore mess")]
 
 

@@ -98,9 +98,21 @@ function notice(page, notice) {
 function cards(page, told) {
   return html`<section class="cards" aria-labelledby="cards"><h2 id="cards">${told.cards_title}</h2>
     ${told.cards.length ? nothing : html`<p class="quiet">${told.cards_hint}</p>`}
-    <ul>${told.cards.map((card) => html`<li>
-      ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
-      <h3>${card.title}</h3><p>${card.text}</p>
-      ${card.actions.map((action) => button(page, action))}
-    </li>`)}</ul></section>`;
+    <ul>${told.cards.map((one) => card(page, one))}</ul>
+    ${told.cards_actions.map((action) => button(page, action))}</section>`;
+}
+
+function card(page, card) {
+  return html`<li>
+    ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
+    <h3>${card.title}</h3><p>${card.text}</p>
+    ${card.actions.map((action) => button(page, action))}
+    ${card.lines.length ? html`<details><summary>${card.lines_title}<span class="unseen"> ${card.title}</span></summary>
+      <ul class="lines">${card.lines.map((line, k) => html`<li><span id="line-${card.key}-${k}">${line.text}</span>
+        <span class="small">${line.actions.map((action) => button(page, action, {about: `line-${card.key}-${k}`}))}</span>
+      </li>`)}</ul></details>` : nothing}
+    ${card.more.length || card.file ? html`<details><summary>${page.say("more")}<span class="unseen"> ${card.title}</span></summary>
+      ${card.file ? html`<a class="button" href="file/${card.file.key}" download=${card.file.name}>${card.file.label}</a>` : nothing}
+      ${card.more.map((action) => button(page, action))}</details>` : nothing}
+  </li>`;
 }

@@ -162,6 +162,26 @@ def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None
     expect(refusal).to_have_text("That does not work: times=10: makes people dizzy; valid: 1 to 9")
 
 
+def test_what_is_kept_is_edited_downloaded_and_brought(page: Page, lamp: Lamp) -> None:
+    page.get_by_text("Its parts").press("Enter")
+    take_off = page.get_by_role("button", name="Take off")
+    expect(take_off).to_have_accessible_description("It has a shade.")
+    take_off.press("Enter")
+    page.get_by_text("More", exact=False).first.press("Enter")
+    page.get_by_label("What to write on it").fill("mine")
+    page.keyboard.press("Enter")
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Export").press("Enter")
+    assert (download.value.suggested_filename, download.value.path().read_bytes()) == ("lamp.txt", b"a lamp")
+    page.get_by_label("A file").set_input_files([{"name": "x", "mimeType": "", "buffer": b"\xff\x00 a lamp"}])
+    page.get_by_role("button", name="Import").press("Enter")
+    assert faults(page) == []
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    for note in ("is dark bare", "is dark mine", "is dark /wAgYSBsYW1w"):
+        expect(page.get_by_role("log").get_by_text(note)).to_be_visible()
+    assert asked(lamp.url, f"{urlsplit(lamp.url).path}file/g")[0] == 404
+
+
 def test_things_are_moved_by_mouse_and_by_keys(page: Page) -> None:
     thing = page.get_by_role("button", name="lamp", exact=True)
     thing.scroll_into_view_if_needed()
@@ -262,8 +282,9 @@ def test_the_texts_of_both_languages_are_the_same_ones() -> None:
 
 def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
     assert runner("goals").communicate(timeout=60)[0] == (
-        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n"
+        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n    runner call lamp switch note=...\n"
     )
+    assert runner("goals", "--graph", str(LAMP)).communicate(timeout=60)[0].startswith("A lamp\n")
     wrong = runner("goals", "A lump")
     assert (wrong.communicate(timeout=60)[0], wrong.returncode) == (
         "A lump: is not remembered; did you mean 'A lamp'? valid: A lamp\n",

@@ -77,6 +77,9 @@ class LampStory:
             case _:
                 pass
 
+    def recall(self) -> None:
+        self._blinked = 100
+
     def tell(self, language: s.Language) -> s.Told:
         text = {"en": "has blinked {} times", "de": "hat {}-mal geblinkt"}[language].format(self._blinked)
         x, y = self._place
@@ -100,5 +103,14 @@ class LampStory:
             s.Map("Where the lamp is", "Drag it.", ground, places, "lamp", "carry"),
             "Lamps",
             "No lamps.",
-            (s.Card("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),),
+            (
+                s.Card(
+                    *("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),
+                    more=(s.Action("lamp", "switch", "Label", {}, s.Ask("note", "What to write on it")),),
+                    lines=(s.Line("It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),),
+                    lines_title="Its parts",
+                    file=s.File("f", "lamp.txt", "Export", np.frombuffer(b"a lamp", np.uint8)),
+                ),
+            ),
+            (s.Action("lamp", "switch", "Import", {}, s.Ask("note", "A file", kind="file")),),
         )

@@ -7,18 +7,21 @@ import string
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
+import msgspec
 import numpy as np
 import pytest
 import yaml
 
 from runner.contract import Message, Refused
+from runner.message.codec import encode
 from runner.page.story import Heard, Language, Notice, Told
 from stages.messages import (
     Arrange,
     Assertion,
-    Forget,
     Frame,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Move,
@@ -35,6 +38,7 @@ from stages.messages import (
 from stages.messages.scene import UnknownRegion
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
+from stages.scene.goals import GoalFolder, unpacked, without
 from stages.story import Story, words
 from stages.story.words import words_of
 from tests.stages.episodes import K, outcome, plan, scene, transfer
@@ -278,12 +282,46 @@ def test_a_goal_is_taught_and_becomes_a_card() -> None:
     (card,) = listener.told().cards
     assert (card.title, card.text) == ("tea", "3 objects: the tray, the cup and the tea box")
     assert card.photo is not None and card.photo in listener.told().photos
-    assert [(one.command, one.arguments, one.now, one.confirm) for one in card.actions] == [
-        ("restore", {"name": "tea"}, True, ""),
-        ("forget", {"name": "tea"}, True, "Forget “tea” for good?"),
+    assert [(one.command, one.arguments, one.now) for one in card.actions] == [("restore", {"name": "tea"}, True)]
+    assert card.more == card.lines == listener.told().cards_actions == ()
+
+
+def test_a_goal_that_is_kept_can_be_edited_and_carried_away(tmp_path: Path) -> None:
+    listener = Listener(goals={"folder": tmp_path})
+    picture = cv2.imencode(".jpg", np.full((480, 640, 3), 90, np.uint8))[1].tobytes()
+    goal = Goal(name="tea", scene=GOAL, pddl="", picture=picture)
+    listener.hear(Kept(goals=(goal,)))
+    (card,) = listener.told().cards
+    assert card.photo is not None and card.photo.rgb.shape == (480, 640, 3) and abs(card.photo.rgb - 90.0).max() < 3
+    assert [(one.command, one.arguments, one.confirm) for one in card.more] == [
+        ("rename", {"name": "tea"}, ""),
+        ("forget", {"name": "tea"}, "Delete “tea” for good?"),
     ]
-    listener.hear(Forget(name="tea"))
+    assert card.file is not None and card.file.name == "tea.zip"
+    assert encode(unpacked(card.file.data.tobytes())) == encode(goal)
+    assert [(line.text, *(one.arguments.get("what") or one.label for one in line.actions)) for line in card.lines] == [
+        ("The tray is on the table.", "on(tray, table)", "tray"),
+        ("The cup is in the tray.", "in(cup, tray)", "cup"),
+        ("The tea box is on the table.", "on(tea_box, table)", "tea_box"),
+        (
+            "The tea box is next to the tray, within 3 cm of where it was shown.",
+            *("Allow 7 cm", "in(tea_box_near_tray, tea_box)"),
+        ),
+    ]
+    loose = msgspec.structs.replace(goal, scene=without(GOAL, "in(cup, tray)"))
+    listener.hear(Kept(goals=(loose,)))
+    line = listener.told("de").cards[0].lines[1]
+    assert (line.text, [one.label for one in line.actions]) == ("Die Tasse darf überall sein.", ["Die Tasse weglassen"])
+    listener.hear(Kept(goals=()))
     assert listener.told().cards == ()
+
+
+def test_what_is_on_disk_is_told_without_a_run(tmp_path: Path) -> None:
+    GoalFolder(tmp_path).write(Goal(name="tea", scene=GOAL, pddl=""))
+    listener = Listener(goals={"folder": tmp_path})
+    assert listener.told().cards == ()
+    listener.story.recall()
+    assert [card.title for card in listener.told("de").cards] == ["tea"]
 
 
 @pytest.mark.parametrize("command_first", [True, False])
