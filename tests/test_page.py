@@ -56,6 +56,10 @@ def restores_and_stops(page: Page) -> None:
         page.keyboard.press(key)
     expect(page.get_by_text("What the robot saw before something was moved")).to_be_visible()
     page.get_by_role("button", name="Restore").click()
+    expect(page.locator(".what")).to_have_text(re.compile(r"Waits for your go; left to move: \d, about 1 min"))
+    expect(page.locator(".arrow")).not_to_have_count(0)
+    assert faults(page) == []
+    page.get_by_role("button", name="Go", exact=True).press("Enter")
     expect(page.locator(".what")).to_have_text("Puts the cup on the table")
     expect(page.get_by_text(re.compile(r"^Step 1 of \d"))).to_be_visible()
     expect(page.get_by_role("button", name="Restore")).to_be_disabled()

@@ -61,12 +61,23 @@ class Outline:
 
 
 @dataclass(frozen=True, slots=True)
+class Arrow:
+    """Something that will be moved in a picture; from and to as x and y in pixels."""
+
+    label: str
+    start: tuple[int, int]
+    end: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
 class View:
     """The newest picture with what was seen in it."""
 
     photo: Photo
     caption: str
     outlines: tuple[Outline, ...] = ()
+    arrows: tuple[Arrow, ...] = ()
+    """In the order in which things will be moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +185,18 @@ class Doing:
     """The one of them that is at work or comes next, from 1; 0 where there are none."""
     since_ns: int = 0
     """When it began, nanoseconds since the epoch."""
+    expected_s: float = 0.0
+    """How long it will probably take from then on, seconds; 0 where nobody knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What the person is asked: nothing goes on until one of the answers is given."""
+
+    text: str
+    answers: tuple[Action, ...]
+    about: str = ""
+    """Names an outline, or is empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +216,7 @@ class Told:
     """All that there is to say now."""
 
     doing: Doing
+    question: Question | None = None
     notice: Notice | None = None
     view: View | None = None
     statements: tuple[Statement, ...] = ()

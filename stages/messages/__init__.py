@@ -14,13 +14,17 @@ from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
 from stages.messages.task import (
+    Answer,
     Arrange,
     Arrangement,
+    Go,
     Goal,
     Look,
     Move,
     Outcome,
+    Pause,
     Plan,
+    Question,
     Restore,
     Stop,
     Task,
@@ -32,6 +36,7 @@ from stages.messages.task import (
 
 __all__ = [
     "Add",
+    "Answer",
     "Arrange",
     "Arrangement",
     "Asked",
@@ -42,6 +47,7 @@ __all__ = [
     "Depth",
     "Forget",
     "Frame",
+    "Go",
     "Goal",
     "Hypothesis",
     "Intrinsics",
@@ -54,11 +60,13 @@ __all__ = [
     "ObjectPose",
     "Observation",
     "Outcome",
+    "Pause",
     "Plan",
     "Points",
     "Pose",
     "Poses",
     "Posterior",
+    "Question",
     "Rename",
     "Restore",
     "Rgb",

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any, Literal
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from runner.contract import Message, Refused
 from runner.page.story import (
     Action,
+    Arrow,
     Ask,
     Card,
     Doing,
@@ -27,15 +29,18 @@ from runner.page.story import (
     Notice,
     Photo,
     Place,
+    Question,
     Statement,
     Told,
     View,
 )
 from stages.messages import (
+    Answer,
     Arrange,
     Arrangement,
     Assertion,
     Frame,
+    Go,
     Goal,
     Kept,
     Look,
@@ -43,6 +48,7 @@ from stages.messages import (
     Move,
     ObjectPose,
     Outcome,
+    Pause,
     Plan,
     Restore,
     SceneEstimate,
@@ -56,10 +62,11 @@ from stages.messages import (
 )
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
+from stages.messages.task import Question as AskedQuestion
 from stages.scene.catalogue import Catalogue
 from stages.scene.goals import MAX_RADIUS, GoalFolder, packed
 from stages.scene.text import support
-from stages.story.outlines import footprint, ground, how_sure, outlines, region_name, surety
+from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
 from stages.story.words import Words, words_of
 
 DEMONSTRATOR, WORLD, GOALS = "demonstrator", "world", "goals"
@@ -68,6 +75,8 @@ WIDER = 0.04
 """Metres by which a region grows when somebody loosens it."""
 NAME = r"[\p{L}\p{N}_\-]+"
 """What the name of a goal may be."""
+STEP_SECONDS = 20.0
+"""What a transfer is expected to take, before one was seen."""
 SHOWN_FAULTS = 4
 """Relations that do not hold, of a goal that was not reached."""
 Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "move"]
@@ -88,6 +97,16 @@ class Job:
     holders: frozenset[str] = frozenset()
     """Objects that things are put into rather than onto."""
     stopping: bool = False
+    question: AskedQuestion | None = None
+    """Waits for an answer."""
+    asks: bool = False
+    """The first plan is to wait for go."""
+    waits: bool = False
+    """The plan waits for go."""
+    pausing: bool = False
+    """The next plan is to wait for go."""
+    step_ns: int = 0
+    """When the newest transfer began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +137,7 @@ class Story:
     hears: tuple[type[Message], ...] = (
         *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, Kept),
         *(LookRequest, Frame, SceneEstimate, SceneGraph),
-        *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
+        *(Goal, Task, Plan, TransferRequest, Outcome, Verdict, AskedQuestion, Answer, Go, Pause),
     )
 
     def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
@@ -143,6 +162,8 @@ class Story:
         self._scene: SceneGraph | None = None
         self._ended: tuple[Goal | Verdict, str] | None = None
         """How the last job ended, and the id of the message that said so."""
+        self._steps_s: list[float] = []
+        """How long transfers took so far, with the look and the plan that follow."""
         self._draws = 0
         """Disturbed scenes so far: each number draws another."""
 
@@ -175,27 +196,50 @@ class Story:
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
             case _:
-                self._work(heard.message)
+                self._work(heard)
 
-    def _work(self, message: Message) -> None:
+    def _work(self, heard: Heard) -> None:
         """What moves a job on."""
         if self._job is None:
             return
-        match message:
+        match heard.message:
             case Stop():
                 self._job = replace(self._job, stopping=True)
             case Task(current=scene):
                 holders = {item.name for item in scene.objects if self._catalogue[item.label].concave}
                 self._job = replace(self._job, phase="plan", holders=frozenset(holders))
             case Plan(transfers=transfers):
-                self._job = replace(self._job, transfers=(*self._job.transfers[: self._job.done], *transfers))
+                planned = (*self._job.transfers[: self._job.done], *transfers)
+                waits = bool(transfers) and (self._job.asks or self._job.pausing)
+                self._job = replace(self._job, transfers=planned, waits=waits, asks=False)
+            case AskedQuestion() as question:
+                self._job = replace(self._job, question=question)
+            case Answer(question=number, choice=choice):
+                asked = self._job.question
+                if asked is not None and asked.number == number and choice in asked.doubt.choices:
+                    self._job = replace(self._job, question=None)
+            case Pause():
+                self._job = replace(self._job, pausing=True)
+            case Go():
+                self._job = replace(self._job, pausing=False, waits=False, asks=False)
             case TransferRequest():
-                self._at("move")
+                self._step(heard.time_ns)
             case Outcome(number=number):
                 self._moved, self._scene = True, None
                 self._job = replace(self._job, done=number)
             case _:
                 pass
+
+    def _step(self, time_ns: int) -> None:
+        """A transfer begins: how long steps take is learned from one to the next."""
+        assert self._job is not None
+        if self._job.step_ns:
+            self._steps_s.append((time_ns - self._job.step_ns) * 1e-9)
+        self._job = replace(self._job, phase="move", waits=False, question=None, step_ns=time_ns)
+
+    @property
+    def _step_seconds(self) -> float:
+        return median(self._steps_s) if self._steps_s else STEP_SECONDS
 
     def _begin(self, heard: Heard) -> None:
         """A look: the first of a job that somebody asked for, or one more of the same."""
@@ -220,7 +264,7 @@ class Story:
             case Teach(name=name):
                 self._job = Job(name, time_ns, phase="teach")
             case Restore(name=name):
-                self._job = Job(name, time_ns, phase="restore")
+                self._job = Job(name, time_ns, phase="restore", asks=command.ask)
             case Look():
                 self._job = Job("", time_ns)
 
@@ -253,6 +297,7 @@ class Story:
         words = words_of(language)
         return Told(
             doing=self._doing(words),
+            question=self._question(words),
             notice=self._notice(words),
             view=self._view(words),
             statements=tuple(self._statements(words)),
@@ -270,18 +315,65 @@ class Story:
             return Doing(words.say("idle" if self._commanded else "script"))
         steps = tuple(_move(transfer, job, words) for transfer in job.transfers)
         step = min(job.done + 1, len(steps))
+        expected = 0.0
+        if job.step_ns and not job.waits:
+            left = (len(steps) - job.done) * self._step_seconds
+            expected = (job.step_ns - job.began_ns) * 1e-9 + left
+        return Doing(self._what(job, steps, step, words), True, steps, step, job.began_ns, expected)
+
+    def _what(self, job: Job, steps: tuple[str, ...], step: int, words: Words) -> str:
+        """What the robot does, or waits for."""
         if job.stopping:
-            text = words.say("stopping")
-        else:
-            text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
-        return Doing(text, True, steps, step, job.began_ns)
+            return words.say("stopping")
+        if job.question is not None:
+            return words.say("asks")
+        if job.waits:
+            minutes = (len(steps) - job.done) * self._step_seconds / 60
+            return words.say("waits", count=len(steps) - job.done, minutes=max(1, round(minutes)))
+        text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
+        return words.say("pausing", text=text) if job.pausing else text
+
+    def _question(self, words: Words) -> Question | None:
+        """What the person is asked."""
+        asked = self._job.question if self._job else None
+        if asked is None:
+            return None
+        doubt = asked.doubt
+        noun = words.noun(doubt.object)
+        key = f"ask_{doubt.stance.replace(' ', '_')}" if doubt.kind == "stance" else f"ask_{doubt.kind}"
+        answers = tuple(
+            Action(
+                DEMONSTRATOR,
+                "answer",
+                words.bare(choice) if choice in names else words.say(f"answer_{choice}"),
+                {"question": str(asked.number), "choice": choice},
+                kind="first" if choice == doubt.choices[0] and doubt.kind != "which" else "plain",
+            )
+            for names in [_names(self._scene)]
+            for choice in doubt.choices
+        )
+        about = region_name(0) if doubt.kind == "unknown" else doubt.object
+        return Question(words.say(key, object=noun), answers, about)
 
     def _view(self, words: Words) -> View | None:
         if self._photo is None:
             return None
         height, width = self._photo.rgb.shape[:2]
         found = outlines(self._estimate, self._catalogue, (height, width), words) if self._estimate else ()
-        return View(self._photo, words.say("outdated" if self._moved else "seen"), found)
+        arrows = tuple(self._arrows(words))
+        return View(self._photo, words.say("outdated" if self._moved else "seen"), found, arrows)
+
+    def _arrows(self, words: Words) -> Iterator[Arrow]:
+        """What will be moved, from where it will be then."""
+        job, scene = self._job, self._scene
+        if job is None or scene is None or scene.T_base_camera is None:
+            return
+        places = {item.name: item.T_base_object for item in scene.objects}
+        for transfer in job.transfers[job.done :]:
+            start, end = places[transfer.object], transfer.T_base_targets[0]
+            pixels = (pixel(T[:3, 3], scene.T_base_camera, scene.K) for T in (start, end))
+            yield Arrow(_move(transfer, job, words), *pixels)
+            places[transfer.object] = end
 
     def _statements(self, words: Words) -> Iterator[Statement]:
         if self._moved and self._job is None:
@@ -309,7 +401,13 @@ class Story:
         idle = self._job is None
         stoppable = self._job is not None and not self._job.stopping
         ask = Ask("name", words.say("name"), words.say("name_hint"), NAME)
-        yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {}, ask, kind="first", now=idle)
+        if self._job is not None and self._job.waits:
+            yield Action(DEMONSTRATOR, "go", words.say("do_go"), {}, kind="first")
+        if self._job is not None and self._job.transfers and not (self._job.waits or self._job.pausing):
+            yield Action(DEMONSTRATOR, "pause", words.say("do_pause"), {}, now=stoppable)
+        if self._job is not None and self._job.pausing and not self._job.waits:
+            yield Action(DEMONSTRATOR, "go", words.say("do_no_pause"), {})
+        yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {"ask": "true"}, ask, kind="first", now=idle)
         yield Action(DEMONSTRATOR, "look", words.say("do_look"), {}, now=idle)
         if self._simulated:
             draw = {"draw": str(self._draws)}
@@ -342,7 +440,12 @@ class Story:
         names = [item.name for item in kept.goal.scene.objects]
         text = words.say("goal", count=len(names), objects=words.nouns(names))
         restore = Action(
-            DEMONSTRATOR, "restore", words.say("do_restore"), {"name": name}, kind="first", now=self._job is None
+            DEMONSTRATOR,
+            "restore",
+            words.say("do_restore"),
+            {"name": name, "ask": "true"},
+            kind="first",
+            now=self._job is None,
         )
         return Card(
             name,
@@ -430,6 +533,10 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
         wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
         loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
         yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+
+
+def _names(scene: SceneGraph | None) -> set[str]:
+    return {item.name for item in scene.objects} if scene else set()
 
 
 def _carries(item: Assertion) -> bool:

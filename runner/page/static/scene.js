@@ -5,12 +5,13 @@ import {map} from "./map.js";
 import {button, lasted} from "./parts.js";
 
 const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
+const BOW = 50; // by which an arrow rises, in the same pixels
 const SIGNS = {sure: "✓", unsure: "?", doubtful: "!", unknown: "?"};
 
 export function scene(page) {
   const told = page.told;
   if (!told) return html`<p class="quiet">${page.say("waiting")}</p>`;
-  const offered = told.actions.filter((action) => action.kind !== "stop");
+  const offered = told.actions.filter((action) => action.kind !== "stop" && (action.now || !told.doing.busy));
   return html`<div class="scene">
     <div class="seen">${view(page, told.view)}</div>
     <div class="said">
@@ -31,16 +32,31 @@ function view(page, view) {
     <div class="picture" style="aspect-ratio: ${width} / ${height}">
       <img src="photo/${view.photo.key}.jpg" width=${width} height=${height} alt=${view.caption}>
       <svg viewBox="0 0 ${width} ${height}" aria-hidden="true">
-        ${view.outlines.map((one) => svg`<path class="${one.surety} ${one.name === page.marked ? "marked" : ""}"
+        ${view.outlines.map((one) => svg`<path class="${one.surety} ${marked(page, one)}"
           d="M${one.points.map((point) => point.join(" ")).join("L")}Z"/>`)}
+        ${view.arrows.map((one, k) => arrow(one, k + Math.max(1, page.told.doing.step)))}
       </svg>
       ${labels(view.outlines).map(([one, x, y]) => html`<span
-        class="name ${one.surety} ${one.name === page.marked ? "marked" : ""}"
+        class="name ${one.surety} ${marked(page, one)}"
         style="left: ${(100 * x) / width}%; top: ${(100 * y) / height}%"
         ><b aria-hidden="true">${SIGNS[one.surety]}</b> ${one.label}</span>`)}
     </div>
     <figcaption>${view.caption}</figcaption>
   </figure>`;
+}
+
+function marked(page, {name}) {
+  return name === page.marked || name === page.told.question?.about ? "marked" : "";
+}
+
+/** What will be moved: a bow from where it is to where it will be, and the number of the step. */
+function arrow({start: [x0, y0], end: [x1, y1]}, step) {
+  const [x, y] = [(x0 + x1) / 2, Math.min(y0, y1) - BOW * (1 + Math.hypot(x1 - x0, y1 - y0) / 300)];
+  const turn = (Math.atan2(y1 - y, x1 - x) * 180) / Math.PI;
+  return svg`<g class="arrow"><path d="M${x0} ${y0}Q${x} ${y} ${x1} ${y1}"/>
+    <path class="head" d="M0 0L-14 -7L-14 7Z" transform="translate(${x1} ${y1}) rotate(${turn})"/>
+    <circle cx=${(x0 + 2 * x + x1) / 4} cy=${(y0 + 2 * y + y1) / 4} r="11"/>
+    <text x=${(x0 + 2 * x + x1) / 4} y=${(y0 + 2 * y + y1) / 4}>${step}</text></g>`;
 }
 
 /** Where each name stands, its middle in pixels of the picture: over its outline, under it where other names are. */
@@ -70,7 +86,8 @@ function statements(page, told) {
 }
 
 function doing(page, told) {
-  const {text, busy, step, steps, since_ns} = told.doing;
+  const {text, busy, step, steps, since_ns, expected_s} = told.doing;
+  const past = Date.now() / 1000 - since_ns / 1e9;
   return html`<section class="doing ${busy ? "busy" : ""}" aria-labelledby="now">
     <h2 id="now">${page.say("now")}</h2>
     <p class="what" role="status">${text}</p>
@@ -78,11 +95,20 @@ function doing(page, told) {
       <ol class="steps">${steps.map((one, k) => html`<li class=${k + 1 < step ? "past" : ""}
         aria-current=${k + 1 === step ? "step" : nothing}>${one}</li>`)}</ol>` : nothing}
     <p class="quiet">${[steps.length ? page.say("step", {step, steps: steps.length}) : "",
-      busy && since_ns ? lasted(Date.now() / 1000 - since_ns / 1e9) : ""].filter(Boolean).join(" · ")}</p>
+      busy && since_ns ? lasted(past) : "",
+      expected_s > past ? page.say("left", {time: lasted(expected_s - past)}) : ""].filter(Boolean).join(" · ")}</p>
+    ${question(page, told.question)}
     ${notice(page, told.notice)}
     ${page.calls.at(-1)?.refused
       ? html`<p class="refused" role="alert">${page.say("refused")} ${page.calls.at(-1).refused}</p>` : nothing}
   </section>`;
+}
+
+/** Asked of the person: what it is about is marked in the picture. */
+function question(page, question) {
+  if (!question) return nothing;
+  return html`<div class="question" role="alert"><p>${question.text}</p>
+    <div class="answers">${question.answers.map((action) => button(page, action))}</div></div>`;
 }
 
 function notice(page, notice) {
@@ -106,7 +132,8 @@ function card(page, card) {
   return html`<li>
     ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
     <h3>${card.title}</h3><p>${card.text}</p>
-    ${card.actions.map((action) => button(page, action))}
+    <div @submit=${() => document.getElementById("main").scrollIntoView({behavior: "smooth"})}>
+      ${card.actions.map((action) => button(page, action))}</div>
     ${card.lines.length ? html`<details><summary>${card.lines_title}<span class="unseen"> ${card.title}</span></summary>
       <ul class="lines">${card.lines.map((line, k) => html`<li><span id="line-${card.key}-${k}">${line.text}</span>
         <span class="small">${line.actions.map((action) => button(page, action, {about: `line-${card.key}-${k}`}))}</span>

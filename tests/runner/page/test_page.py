@@ -162,6 +162,16 @@ def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None
     expect(refusal).to_have_text("That does not work: times=10: makes people dizzy; valid: 1 to 9")
 
 
+def test_a_question_is_asked_and_marked_and_answered(page: Page) -> None:
+    asked_now = page.get_by_role("alert").filter(has_text="Is it bright?")
+    expect(asked_now).to_be_visible()
+    expect(page.locator(".picture .name.marked")).to_have_text("? unsure lamp")
+    expect(page.locator(".picture .arrow text")).to_have_text("1")
+    asked_now.get_by_role("button", name="Very").press("Enter")
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    expect(page.get_by_role("log")).to_contain_text("is dark very bright")
+
+
 def test_what_is_kept_is_edited_downloaded_and_brought(page: Page, lamp: Lamp) -> None:
     page.get_by_text("Its parts").press("Enter")
     take_off = page.get_by_role("button", name="Take off")

@@ -93,8 +93,9 @@ class LampStory:
         )
         return s.Told(
             s.Doing(text, self._blinked > 0, ("Switches on.", "Switches off."), 1, 1),
+            s.Question("Is it bright?", (s.Action("lamp", "switch", "Very", {"note": "very bright"}),), "unsure"),
             s.Notice(self._blinked < 5, "the lamp is well", ("Let it cool.",), "lamp.blinked#0"),
-            s.View(self._photo, "A lamp.", outlines),
+            s.View(self._photo, "A lamp.", outlines, (s.Arrow("up", (10, 30), (50, 20)),)),
             tuple(s.Statement(f"There is a {one.label}.", one.name, one.surety, one.how_sure) for one in outlines),
             (
                 s.Action("lamp", "blink", "Blink", {}, ask, "first"),

@@ -17,15 +17,19 @@ from runner.contract import Message, Refused
 from runner.message.codec import encode
 from runner.page.story import Heard, Language, Notice, Told
 from stages.messages import (
+    Answer,
     Arrange,
     Assertion,
     Frame,
+    Go,
     Goal,
     Kept,
     Look,
     LookRequest,
     Move,
     ObjectPose,
+    Pause,
+    Question,
     Restore,
     SceneEstimate,
     SceneGraph,
@@ -35,13 +39,13 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.scene import UnknownRegion
+from stages.messages.scene import Doubt, Stance, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.goals import GoalFolder, unpacked, without
 from stages.story import Story, words
 from stages.story.words import words_of
-from tests.stages.episodes import K, outcome, plan, scene, transfer
+from tests.stages.episodes import K, outcome, plan, scene, transfer, translation
 
 CONFIGS: dict[str, dict[str, Any]] = {"demonstrator": {"catalogue": BUILT_IN, "scripted": False}, "world": {}}
 GOAL = scene({"tray": "table", "cup": "tray", "tea_box": "table"}, beside={"tea_box": "tray"})
@@ -282,7 +286,9 @@ def test_a_goal_is_taught_and_becomes_a_card() -> None:
     (card,) = listener.told().cards
     assert (card.title, card.text) == ("tea", "3 objects: the tray, the cup and the tea box")
     assert card.photo is not None and card.photo in listener.told().photos
-    assert [(one.command, one.arguments, one.now) for one in card.actions] == [("restore", {"name": "tea"}, True)]
+    assert [(one.command, one.arguments, one.now) for one in card.actions] == [
+        ("restore", {"name": "tea", "ask": "true"}, True)
+    ]
     assert card.more == card.lines == listener.told().cards_actions == ()
 
 
@@ -373,6 +379,56 @@ def test_a_stop_is_told_until_it_has_come() -> None:
     assert (listener.doing, listener.offered()["stop"]) == ("Finishes this, then stops", False)
     listener.hear(verdict(STOPPED, "stopped, as asked"))
     assert (listener.notice.text, listener.notice.good) == ("Stopped, as you asked.", True)
+
+
+def test_a_plan_is_shown_before_go_and_a_pause_holds_the_next() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea", ask=True))
+    listener.seen(START)
+    listener.hear(Task(goal_name="tea", goal=GOAL, current=START))
+    target = msgspec.structs.replace(STEP, T_base_targets=translation(0.8, 0.3, 0.7)[None])
+    listener.hear(plan(target, transfer("tea_box", "table", "table")))
+    assert listener.doing == "Waits for your go; left to move: 2, about 1 min"
+    view = listener.told().view
+    assert view is not None and view.arrows[0].label == "Puts the cup into the tray"
+    assert view.arrows[0].start != view.arrows[0].end
+    assert listener.offered()["go"] and "pause" not in listener.offered()
+    listener.hear(Go(), TransferRequest(transfer=STEP, scene=START, number=1))
+    assert "go" not in listener.offered() and listener.offered()["pause"]
+    assert 39 < listener.told().doing.expected_s < 60
+    listener.hear(Pause())
+    assert listener.doing == "Puts the cup into the tray; then waits for you" and "pause" not in listener.offered()
+    listener.hear(outcome(1, STEP), LookRequest(purpose="after transfer 1"))
+    listener.seen(START)
+    listener.hear(plan(transfer("tea_box", "table", "table")))
+    assert listener.doing == "Waits for your go; left to move: 1, about 1 min" and listener.offered()["go"]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
+    doubts = [
+        *(Doubt(kind="stance", object="cup", stance=stance) for stance in get_args(Stance)),
+        Doubt(kind="unknown", object="", choices=("leave", "again")),
+        Doubt(kind="which", object="cup", choices=("cup", "tea_box", "again")),
+    ]
+    listener, texts = Listener(), set[str]()
+    listener.called(Restore(name="tea", ask=True))
+    listener.seen(GOAL)
+    for number, doubt in enumerate(doubts, 1):
+        listener.hear(Question(number=number, doubt=doubt))
+        asked = listener.told(language).question
+        assert asked is not None and asked.about == (doubt.object or "unknown_0")
+        texts.add(asked.text)
+        assert [one.arguments for one in asked.answers] == [
+            {"question": str(number), "choice": choice} for choice in doubt.choices
+        ]
+        assert len({one.label for one in asked.answers}) == len(doubt.choices)
+        listener.hear(Answer(question=number, choice="perhaps"), Answer(question=number - 1, choice="again"))
+        assert listener.told().question is not None
+        listener.hear(Answer(question=number, choice="again"))
+        assert listener.told().question is None
+    assert len(texts) == len(doubts)
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
