@@ -74,6 +74,6 @@ def tells_it_in_german(page: Page) -> None:
     page.get_by_role("button", name="Noch einmal hinsehen").click()
     expect(page.get_by_text("Erkennt, was da ist")).to_be_visible()
     expect(page.get_by_text("Der Roboter wartet auf Sie")).to_be_visible()
-    expect(page.get_by_text("Das Tablett ist auf dem Tisch.")).to_be_visible()
+    expect(page.get_by_role("region", name="Was da ist").get_by_text("Das Tablett ist auf dem Tisch.")).to_be_visible()
     page.get_by_role("link", name="Verlauf").click()
     expect(page.get_by_text("wird geschrieben")).to_be_visible()

@@ -19,6 +19,7 @@ import uvicorn
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -28,9 +29,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from runner.contract import Refused
 from runner.live.live import Live
 from runner.page.calls import PageCalls
-from runner.page.feed import Feed
+from runner.page.feed import Feed, shape
 from runner.page.guard import Guard, is_loopback, new_token
 from runner.page.history import past_runs
+from runner.page.past import moments
 from runner.page.story import Language, Photo
 from runner.page.watch import Watch
 from runner.supervise.calls import CallRequest
@@ -69,6 +71,8 @@ class Page:
         """By every open page."""
         self._photos: dict[str, bytes] = {}
         """JPEG by key."""
+        self._past_photos: tuple[str, dict[str, Photo]] = ("", {})
+        """Of the recording that was told again last."""
         self._files: dict[str, bytes] = {}
         """What can be downloaded, by key."""
         self._news, self._looks = asyncio.Event(), asyncio.Event()
@@ -87,6 +91,8 @@ class Page:
             Route("/file/{key}", self._file),
             Route("/runs", self._runs),
             Route("/runs/{name}.mcap", self._download),
+            Route("/runs/{name}/{language}.json", self._past),
+            Route("/runs/{name}/{key}.jpg", self._past_photo),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ]
 
@@ -204,10 +210,32 @@ class Page:
         return Response(msgspec.json.encode(found), media_type="application/json")
 
     async def _download(self, request: Request) -> Response:
+        path = self._recording(request)
+        return FileResponse(path, filename=path.name)
+
+    async def _past(self, request: Request) -> Response:
+        """A recording told again; its pictures are kept until another one is."""
+        path, language = self._recording(request), request.path_params["language"]
+        try:
+            found, photos = await run_in_threadpool(moments, path, msgspec.convert(language, Language))
+        except (Refused, msgspec.ValidationError) as refusal:
+            return PlainTextResponse(str(refusal), 422)
+        self._past_photos = (path.stem, photos)
+        return Response(msgspec.json.encode(found, enc_hook=shape), media_type="application/json")
+
+    async def _past_photo(self, request: Request) -> Response:
+        name, photos = self._past_photos
+        photo = photos.get(request.path_params["key"])
+        if photo is None or name != request.path_params["name"]:
+            return PlainTextResponse("this picture is not kept any more\n", 404)
+        return Response(await run_in_threadpool(_jpeg, photo), media_type="image/jpeg")
+
+    def _recording(self, request: Request) -> Path:
+        """The recording that is asked for; it must be one of the folder."""
         name = request.path_params["name"]
         if name not in {path.stem for path in self._folder.glob("*.mcap")}:
-            return PlainTextResponse(f"{name}: no such recording\n", 404)
-        return FileResponse(self._folder / f"{name}.mcap", filename=f"{name}.mcap")
+            raise HTTPException(404, f"{name}: no such recording\n")
+        return self._folder / f"{name}.mcap"
 
     @property
     def _folder(self) -> Path:

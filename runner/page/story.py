@@ -206,9 +206,11 @@ class Notice:
     good: bool
     text: str
     help: tuple[str, ...] = ()
-    """What the person can do about it."""
+    """What is wrong, and what the person can do about it."""
     message: str = ""
-    """Id of the message that said so, for the engineer."""
+    """Id of the message that said so."""
+    tried: tuple[str, ...] = ()
+    """What was tried in vain, under a title that comes first."""
 
 
 @dataclass(frozen=True, slots=True)

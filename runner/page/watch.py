@@ -33,7 +33,10 @@ class Watch:
     """The story and the newest log lines of one run, as far as they have been read."""
 
     def __init__(self, recording: Path, changed: Callable[[], object], stopped: Callable[[], bool]) -> None:
-        """``changed`` is called, on another thread, after each record that changes something."""
+        """``changed`` is called, on the thread that reads, after each record that changes something."""
+        self.newest: Heard | None = None
+        self.began_ns = 0
+        """When the first record was made, nanoseconds since the epoch."""
         self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
         self._recording = recording
         self._changed = changed
@@ -74,6 +77,8 @@ class Watch:
         return self._stopped()
 
     def _take(self, record: Entry | Metadata) -> None:
+        if not isinstance(record, Metadata):
+            self.began_ns = self.began_ns or record.message.log_time
         if isinstance(record, Metadata):
             if record.name == RUN:
                 self._prepare(graph_from_json(record.metadata["graph"], str(self._recording)))
@@ -105,6 +110,7 @@ class Watch:
             heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, entry.message.log_time)
             with self._telling:
                 self._story.hear(heard)
+            self.newest = heard
         except Exception as error:
             print(f"{entry.topic} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
 

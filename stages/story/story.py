@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
 
-import cv2
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from runner.contract import Message, Refused
 from runner.page.story import (
@@ -21,10 +17,8 @@ from runner.page.story import (
     Ask,
     Card,
     Doing,
-    File,
     Heard,
     Language,
-    Line,
     Map,
     Notice,
     Photo,
@@ -38,7 +32,6 @@ from stages.messages import (
     Answer,
     Arrange,
     Arrangement,
-    Assertion,
     Frame,
     Go,
     Goal,
@@ -64,17 +57,15 @@ from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.messages.task import Question as AskedQuestion
 from stages.scene.catalogue import Catalogue
-from stages.scene.goals import MAX_RADIUS, GoalFolder, packed
+from stages.scene.goals import GoalFolder
 from stages.scene.text import support
+from stages.story import reasons
+from stages.story.cards import GOALS, NAME, Remembered, add, card
 from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, WORLD, GOALS = "demonstrator", "world", "goals"
+DEMONSTRATOR, WORLD = "demonstrator", "world"
 """Stages that take commands, as our graphs call them."""
-WIDER = 0.04
-"""Metres by which a region grows when somebody loosens it."""
-NAME = r"[\p{L}\p{N}_\-]+"
-"""What the name of a goal may be."""
 STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
 SHOWN_FAULTS = 4
@@ -109,28 +100,6 @@ class Job:
     """When the newest transfer began."""
 
 
-@dataclass(frozen=True, slots=True)
-class Remembered:
-    """A goal, the picture in which it was shown, and itself as a file."""
-
-    goal: Goal
-    photo: Photo | None
-    file: NDArray[np.uint8] | None = None
-    """None where goals are not kept."""
-
-    @staticmethod
-    def of(goal: Goal) -> Remembered:
-        """One that is kept."""
-        file = np.frombuffer(packed(goal), np.uint8)
-        bgr = cv2.imdecode(np.frombuffer(goal.picture, np.uint8), cv2.IMREAD_COLOR) if goal.picture else None
-        photo = (
-            None
-            if bgr is None
-            else Photo(_key(goal.picture), np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
-        )
-        return Remembered(goal, photo, file)
-
-
 class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
@@ -162,6 +131,8 @@ class Story:
         self._scene: SceneGraph | None = None
         self._ended: tuple[Goal | Verdict, str] | None = None
         """How the last job ended, and the id of the message that said so."""
+        self._failed: list[tuple[Job, Outcome]] = []
+        """Transfers of the newest job that failed, and how far it was then."""
         self._steps_s: list[float] = []
         """How long transfers took so far, with the look and the plan that follow."""
         self._draws = 0
@@ -212,23 +183,15 @@ class Story:
                 planned = (*self._job.transfers[: self._job.done], *transfers)
                 waits = bool(transfers) and (self._job.asks or self._job.pausing)
                 self._job = replace(self._job, transfers=planned, waits=waits, asks=False)
-            case AskedQuestion() as question:
-                self._job = replace(self._job, question=question)
-            case Answer(question=number, choice=choice):
-                asked = self._job.question
-                if asked is not None and asked.number == number and choice in asked.doubt.choices:
-                    self._job = replace(self._job, question=None)
-            case Pause():
-                self._job = replace(self._job, pausing=True)
-            case Go():
-                self._job = replace(self._job, pausing=False, waits=False, asks=False)
             case TransferRequest():
                 self._step(heard.time_ns)
-            case Outcome(number=number):
+            case Outcome() as outcome:
                 self._moved, self._scene = True, None
-                self._job = replace(self._job, done=number)
+                if not outcome.success:
+                    self._failed.append((self._job, outcome))
+                self._job = replace(self._job, done=outcome.number)
             case _:
-                pass
+                self._job = _talked(self._job, heard.message)
 
     def _step(self, time_ns: int) -> None:
         """A transfer begins: how long steps take is learned from one to the next."""
@@ -259,7 +222,7 @@ class Story:
             self._asked[heard.id] = command
 
     def _start(self, command: Teach | Restore | Look, time_ns: int) -> None:
-        self._ended = None
+        self._ended, self._failed = None, []
         match command:
             case Teach(name=name):
                 self._job = Job(name, time_ns, phase="teach")
@@ -305,9 +268,16 @@ class Story:
             map=self._map(words),
             cards_title=words.say("goals"),
             cards_hint=words.say("no_goals"),
-            cards=tuple(self._card(name, kept, words) for name, kept in self._goals.items()),
-            cards_actions=(_add(words),) if self._folder else (),
+            cards=tuple(self._cards(words)),
+            cards_actions=(add(words),) if self._folder else (),
         )
+
+    def _cards(self, words: Words) -> Iterator[Card]:
+        for name, kept in self._goals.items():
+            asked = {"name": name, "ask": "true"}
+            label, now = words.say("do_restore"), self._job is None
+            restore = Action(DEMONSTRATOR, "restore", label, asked, kind="first", now=now)
+            yield card(kept, (restore,) if self._commanded else (), words)
 
     def _doing(self, words: Words) -> Doing:
         job = self._job
@@ -436,29 +406,6 @@ class Story:
         )
         return Map(words.say("map"), words.say("map_hint"), ground(scene), places, WORLD, "move")
 
-    def _card(self, name: str, kept: Remembered, words: Words) -> Card:
-        names = [item.name for item in kept.goal.scene.objects]
-        text = words.say("goal", count=len(names), objects=words.nouns(names))
-        restore = Action(
-            DEMONSTRATOR,
-            "restore",
-            words.say("do_restore"),
-            {"name": name, "ask": "true"},
-            kind="first",
-            now=self._job is None,
-        )
-        return Card(
-            name,
-            name,
-            text,
-            kept.photo,
-            (restore,) if self._commanded else (),
-            more=tuple(_kept_actions(name, words)) if kept.file is not None else (),
-            lines=tuple(_lines(kept.goal, words)) if kept.file is not None else (),
-            lines_title=words.say("matters"),
-            file=_file(name, kept.file, words) if kept.file is not None else None,
-        )
-
     # ------------------------------------------------------------------------------------------ how it ended
 
     def _notice(self, words: Words) -> Notice | None:
@@ -473,8 +420,18 @@ class Story:
         if end.failed_stage == STOPPED:
             return Notice(True, words.say("stopped"), message=id)
         key = "failed" if end.goal_name in self._goals else "not_remembered"
-        help = (*self._faults(end, words), words.say(f"help_{end.failed_stage}"))
-        return Notice(False, words.say(key, name=end.goal_name, reason=end.reason), help, id)
+        help = (words.say(f"at_{end.failed_stage}"), *self._faults(end, words), words.say(f"help_{end.failed_stage}"))
+        text = words.say(key, name=end.goal_name, reason=reasons.told(end.reason, words))
+        return Notice(False, text, help, id, tuple(self._attempts(words)))
+
+    def _attempts(self, words: Words) -> Iterator[str]:
+        """What was tried in vain."""
+        if self._failed:
+            yield words.say("tried")
+        for job, failed in self._failed:
+            step = _move(job.transfers[failed.number - 1], job, words)
+            reason = reasons.told(f"{failed.failed_stage}: {failed.reason}", words)
+            yield words.say("tried_step", step=step, reason=reason)
 
     def _faults(self, verdict: Verdict, words: Words) -> list[str]:
         """What is not where it belongs, as sentences."""
@@ -492,59 +449,29 @@ class Story:
         return found[:SHOWN_FAULTS]
 
 
-def _kept_actions(name: str, words: Words) -> Iterator[Action]:
-    """What can be done with a goal on disk."""
-    ask = Ask("to", words.say("new_name"), words.say("name_hint"), NAME)
-    yield Action(GOALS, "rename", words.say("do_rename"), {"name": name}, ask)
-    yield Action(GOALS, "forget", words.say("do_forget"), {"name": name}, confirm=words.say("forget_sure", name=name))
-
-
-def _add(words: Words) -> Action:
-    return Action(GOALS, "add", words.say("do_add"), {}, Ask("file", words.say("add_file"), kind="file"))
-
-
-def _file(name: str, data: NDArray[np.uint8], words: Words) -> File:
-    return File(_key(data.tobytes()), f"{name}.zip", words.say("do_export"), data)
-
-
-def _key(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:16]
-
-
-def _lines(goal: Goal, words: Words) -> Iterator[Line]:
-    """What a goal asks for, and how to ask for less."""
-    scene, carried = goal.scene, {item.arguments[0]: item for item in goal.scene.assertions if _carries(item)}
-
-    def strike(what: str, label: str) -> Action:
-        return Action(GOALS, "strike", label, {"name": goal.name, "what": what})
-
-    for item in scene.objects:
-        noun, found = words.noun(item.name), carried.get(item.name)
-        text = words.say("anywhere", object=noun)
-        if found is not None:
-            text = words.say(f"is_{found.predicate}", child=noun, supporter=words.noun(found.arguments[1]))
-        loose = () if found is None else (strike(str(found), words.say("do_strike")),)
-        out = (strike(item.name, words.say("do_leave_out", object=noun)),) if len(scene.objects) > 1 else ()
-        yield Line(f"{text}.", (*loose, *out))
-    for region in scene.virtual_objects:
-        parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
-        text = words.say("is_beside", **parts, off=round(100 * region.radius))
-        radius = min(region.radius + WIDER, MAX_RADIUS)
-        wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
-        loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
-        yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
-
-
 def _names(scene: SceneGraph | None) -> set[str]:
     return {item.name for item in scene.objects} if scene else set()
 
 
-def _carries(item: Assertion) -> bool:
-    return item.predicate in ("on", "in")
-
-
 def _statement(text: str, name: str, item: ObjectPose | None, words: Words) -> Statement:
     return Statement(text, name) if item is None else Statement(text, name, surety(item), how_sure(item, words))
+
+
+def _talked(job: Job, message: Message) -> Job:
+    """A job after what the robot and the person have said to each other."""
+    match message:
+        case AskedQuestion() as question:
+            return replace(job, question=question)
+        case Answer(question=number, choice=choice):
+            asked = job.question
+            taken = asked is not None and asked.number == number and choice in asked.doubt.choices
+            return replace(job, question=None) if taken else job
+        case Pause():
+            return replace(job, pausing=True)
+        case Go():
+            return replace(job, pausing=False, waits=False, asks=False)
+        case _:
+            return job
 
 
 def _move(transfer: Transfer, job: Job, words: Words) -> str:

@@ -50,8 +50,12 @@ class Words:
 
     def say(self, key: str, **parts: object) -> str:
         """The text of a key with its parts, beginning with a capital."""
-        text = self._texts[key].format(**parts)
+        text = self.part(key, **parts)
         return text[:1].upper() + text[1:]
+
+    def part(self, key: str, **parts: object) -> str:
+        """The same within a sentence."""
+        return self._texts[key].format(**parts)
 
     def noun(self, name: str) -> Noun:
         """An object by its name in a scene: that of its label, with a number where there are several."""

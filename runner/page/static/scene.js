@@ -25,12 +25,12 @@ export function scene(page) {
   </div>`;
 }
 
-function view(page, view) {
+export function view(page, view) {
   if (!view) return html`<div class="picture empty"><p>${page.say("nothing_seen")}</p></div>`;
   const [height, width] = view.photo.rgb;
   return html`<figure>
     <div class="picture" style="aspect-ratio: ${width} / ${height}">
-      <img src="photo/${view.photo.key}.jpg" width=${width} height=${height} alt=${view.caption}>
+      <img src="${page.photos ?? "photo"}/${view.photo.key}.jpg" width=${width} height=${height} alt=${view.caption}>
       <svg viewBox="0 0 ${width} ${height}" aria-hidden="true">
         ${view.outlines.map((one) => svg`<path class="${one.surety} ${marked(page, one)}"
           d="M${one.points.map((point) => point.join(" ")).join("L")}Z"/>`)}
@@ -73,7 +73,7 @@ function labels(outlines) {
   return placed;
 }
 
-function statements(page, told) {
+export function statements(page, told) {
   if (!told.statements.length) return nothing;
   const mark = (name) => () => { page.marked = name; page.draw(); };
   return html`<section class="there" aria-labelledby="there"><h2 id="there">${page.say("there")}</h2>
@@ -105,19 +105,22 @@ function doing(page, told) {
 }
 
 /** Asked of the person: what it is about is marked in the picture. */
-function question(page, question) {
+export function question(page, question) {
   if (!question) return nothing;
   return html`<div class="question" role="alert"><p>${question.text}</p>
     <div class="answers">${question.answers.map((action) => button(page, action))}</div></div>`;
 }
 
-function notice(page, notice) {
+export function notice(page, notice, run = page.run?.name) {
   if (!notice) return nothing;
+  const [title, ...tried] = notice.tried;
   return html`<div class="notice ${notice.good ? "good" : "bad"}" role=${notice.good ? "status" : "alert"}>
     <p>${notice.text}</p>
     ${notice.help.length ? html`<ul>${notice.help.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
-    ${notice.good || !notice.message ? nothing : html`<p class="quiet">${page.say("ask_engineer")}
-      <code>runner why ${notice.message}</code></p>`}
+    ${title ? html`<p>${title}</p><ul>${tried.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
+    ${notice.good || !notice.message ? nothing : html`
+      ${run ? html`<p><a href="#history/${run}/${notice.message}">${page.say("see_moment")}</a></p>` : nothing}
+      <p class="quiet">${page.say("ask_engineer")} <code>runner why ${notice.message}</code></p>`}
   </div>`;
 }
 

@@ -290,6 +290,36 @@ def test_the_texts_of_both_languages_are_the_same_ones() -> None:
     assert asked_for <= english.keys()
 
 
+def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) -> None:
+    for _ in range(2):
+        page.get_by_label("How often").fill("1")
+        page.keyboard.press("Enter")
+    blinked = re.compile(r"has blinked (\d+) times")
+    page.get_by_role("link", name="History").click()
+    page.get_by_role("link", name="Replay").click()
+    then, slider = page.get_by_role("region", name="Then"), page.get_by_label("Moment")
+    expect(then).to_contain_text(blinked)
+    (first,) = blinked.findall(then.inner_text())
+    second = f"has blinked {int(first) + 1} times"
+    expect(page.get_by_role("img", name="A lamp.")).to_be_visible()
+    page.wait_for_function("document.querySelector('figure img').naturalWidth === 64")
+    page.get_by_role("button", name="Next").press("Enter")
+    expect(then).to_contain_text(second)
+    slider.press("ArrowLeft")
+    expect(then).not_to_contain_text(second)
+    expect(slider).to_have_attribute("aria-valuetext", re.compile(rf"\d s: has blinked {first} times"))
+    assert faults(page) == []
+    page.get_by_role("button", name="Play").press("Enter")
+    expect(then).to_contain_text(second)
+    run = page.url.rpartition("/")[2]
+    page.goto(f"{page.url.partition('#')[0]}#history/{run}/lamp.blinked#1")
+    expect(then).to_contain_text("runner why lamp.blinked#1")
+    page.get_by_label("Language").select_option("de")
+    expect(page.get_by_role("region", name="Damals")).to_contain_text(f"{int(first) + 1}-mal geblinkt")
+    path = urlsplit(lamp.url).path
+    assert [asked(lamp.url, f"{path}runs/{one}")[0] for one in (f"{run}/fr.json", "nothing/en.json")] == [422, 404]
+
+
 def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
     assert runner("goals").communicate(timeout=60)[0] == (
         "A lamp\n    It blinks.\n    runner call lamp blink times=10\n    runner call lamp switch note=...\n"

@@ -445,18 +445,34 @@ def test_a_failure_says_what_is_wrong_and_what_helps(stage: str, language: Langu
     id = listener.hear(verdict(stage, "no room", violated))
     notice = listener.told(language).notice
     assert notice is not None
-    assert (notice.good, notice.message, len(notice.help), "no room" in notice.text) == (False, id, 3, True)
-    assert language != "en" or notice.help[:2] == (
+    assert (notice.good, notice.message, len(notice.help), "no room" in notice.text) == (False, id, 4, True)
+    assert language != "en" or notice.help[1:3] == (
         "The cup should be in the tray.",
         "The tea box should be next to the tray.",
     )
+
+
+def test_what_was_tried_in_vain_is_told() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    listener.seen(START)
+    listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1))
+    listener.hear(outcome(1, STEP, failed_stage="grasp", reason="no way to lift it"), verdict("executor", "no"))
+    assert listener.notice.help[0] == "It came to an end while moving things."
+    assert listener.notice.tried == (
+        "What was tried:",
+        "Puts the cup on the tray: while grasping, it cannot be lifted without touching something",
+    )
+    listener.called(Look())
+    assert listener.told().notice is None
 
 
 def test_what_was_not_remembered_is_said_so() -> None:
     listener = Listener()
     listener.called(Teach(name="tea"))
     listener.hear(verdict("perception", "2 of 6 objects seen"))
-    assert listener.notice.text == "“tea” is not remembered: 2 of 6 objects seen."
+    assert listener.notice.text == "“tea” is not remembered: only 2 of 6 objects were seen."
 
 
 def test_a_scripted_robot_takes_no_commands() -> None:
