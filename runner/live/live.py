@@ -6,7 +6,7 @@ import contextlib
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import NamedTuple, TypeVar
 
@@ -41,11 +41,12 @@ class Header(NamedTuple):
 
 
 class Backlog:
-    """What a terminal has still to show of some messages."""
+    """What a terminal or a page has still to show of some messages."""
 
-    def __init__(self, bus: Bus, path: str) -> None:
+    def __init__(self, bus: Bus, *paths: str) -> None:
         self._packets: queue.Queue[Packet] = queue.Queue(BACKLOG)
-        bus.hand_over(path, self._receive)
+        for path in paths:
+            bus.hand_over(path, self._receive)
 
     def take(self, timeout_s: float) -> Iterator[Packet]:
         """What has arrived; waits for the first, but not for longer than ``timeout_s``."""
@@ -124,6 +125,12 @@ class Live:
             yield from packets
             if not packets and not is_alive(self.entry):
                 return
+
+    def overheard(self, topics: Iterable[str]) -> Iterator[list[Packet]]:
+        """Messages of several topics as they come, those of a moment at once; never ends, and yields nothing, too."""
+        backlog = Backlog(self.bus, *(f"m/{topic}" for topic in topics))
+        while True:
+            yield list(backlog.take(POLL_SECONDS))
 
     def headers(self, topic: str) -> Iterator[list[Header]]:
         """Once a second the headers of the last ten seconds, until the run ends."""
