@@ -7,7 +7,7 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -261,8 +261,9 @@ class Story(Protocol):
     hears: tuple[type[Message], ...]
     """The messages that it follows; the others are not read."""
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
-        """``configs`` holds every stage's settings by stage name, as the graph runs with them."""
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
+        """``configs`` holds every stage's settings by stage name, as the graph runs with them, and ``commands`` the
+        names of what it can be asked."""
         ...
 
     def hear(self, heard: Heard) -> None:
@@ -283,4 +284,5 @@ def load_story(graph: Graph) -> Story | None:
     if graph.story is None:
         return None
     story = load_class(graph.story, f"story of graph {graph.name!r}")
-    return story({name: node_entry(node)["config"] for name, node in graph.nodes.items()})
+    configs = {name: node_entry(node)["config"] for name, node in graph.nodes.items()}
+    return story(configs, {name: tuple(node.type.commands) for name, node in graph.nodes.items()})

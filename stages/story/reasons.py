@@ -10,6 +10,9 @@ _NAMES = r"(?P<names>\w+(?:, \w+)*)"
 _ITEM, _OTHER, _PLACE = r"(?P<item>\w+)", r"(?P<other>\w+)", r"(?P<place>\w+)"
 _NUMBER, _OF = r"(?P<number>[\d.]+)", r"(?P<of>[\d.]+)"
 REASONS = {
+    "stopped_empty": r"stopped, as asked; in the hand: nothing",
+    "stopped_holding": rf"stopped, as asked; in the hand: {_NAMES}",
+    "stopped": r"stopped, as asked",
     "too_few": rf"{_NUMBER} of {_OF} objects seen",
     "floats": rf"not seen: what carries {_NAMES}",
     "unseen": rf"not seen: {_NAMES}",

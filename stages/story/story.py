@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -64,7 +64,7 @@ from stages.story.cards import GOALS, NAME, Remembered, add, card
 from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, WORLD = "demonstrator", "world"
+DEMONSTRATOR, EXECUTOR, WORLD = "demonstrator", "executor", "world"
 """Stages that take commands, as our graphs call them."""
 STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
@@ -109,7 +109,7 @@ class Story:
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict, AskedQuestion, Answer, Go, Pause),
     )
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
         """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
         paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
         if not paths:
@@ -117,6 +117,8 @@ class Story:
         self._catalogue = Catalogue.load(Path(paths[0]))
         self._commanded = DEMONSTRATOR in configs and not configs[DEMONSTRATOR].get("scripted", True)
         self._simulated = WORLD in configs
+        self._brakes = "stop" in commands.get(EXECUTOR, ())
+        """Whether an arm that moves can be stopped at once."""
         self._folder = Path(configs[GOALS]["folder"]) if GOALS in configs else None
         self._asked: dict[str, Teach | Restore | Look] = {}
         """Commands by id, until the stage takes them up."""
@@ -383,7 +385,9 @@ class Story:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
+        moves = self._brakes and self._job is not None and self._job.phase == "move"
+        who = EXECUTOR if moves else DEMONSTRATOR
+        yield Action(who, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
 
     def _map(self, words: Words) -> Map | None:
         """The scene from above, where people may move what carries nothing."""
@@ -418,7 +422,7 @@ class Story:
         if end.success:
             return Notice(True, words.say("restored", name=end.goal_name), message=id)
         if end.failed_stage == STOPPED:
-            return Notice(True, words.say("stopped"), message=id)
+            return Notice(True, f"{words.capital(reasons.told(end.reason, words))}.", message=id)
         key = "failed" if end.goal_name in self._goals else "not_remembered"
         help = (words.say(f"at_{end.failed_stage}"), *self._faults(end, words), words.say(f"help_{end.failed_stage}"))
         text = words.say(key, name=end.goal_name, reason=reasons.told(end.reason, words))

@@ -50,7 +50,11 @@ class Words:
 
     def say(self, key: str, **parts: object) -> str:
         """The text of a key with its parts, beginning with a capital."""
-        text = self.part(key, **parts)
+        return self.capital(self.part(key, **parts))
+
+    @staticmethod
+    def capital(text: str) -> str:
+        """The beginning of a sentence."""
         return text[:1].upper() + text[1:]
 
     def part(self, key: str, **parts: object) -> str:

@@ -8,6 +8,8 @@ from stages.story.reasons import REASONS, told
 from stages.story.words import words_of
 
 SAID = {
+    "stopped, as asked": "angehalten, wie gewünscht",
+    "stopped, as asked; in the hand: tea_box": "angehalten, wie gewünscht; in der Hand ist noch die Teeschachtel",
     "2 of 6 objects seen (3 looks at scene 'goal')": "nur 2 von 6 Dingen waren zu sehen, nach 3-mal Hinsehen",
     "not seen: cup, tea_box": "nicht zu sehen: die Tasse und die Teeschachtel",
     "not seen: what carries soup_can (1 looks at scene 'start')": (

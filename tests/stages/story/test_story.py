@@ -58,8 +58,8 @@ LANGUAGES: tuple[Language, ...] = get_args(Language)
 class Listener:
     """A story that is told messages with ids of their own."""
 
-    def __init__(self, **configs: dict[str, Any]) -> None:
-        self.story = Story({**CONFIGS, **configs})
+    def __init__(self, *, brakes: bool = False, **configs: dict[str, Any]) -> None:
+        self.story = Story({**CONFIGS, **configs}, {"executor": ("stop",) if brakes else ()})
         self._heard = 0
 
     def hear(self, *messages: Message, causes: tuple[str, ...] = ()) -> str:
@@ -431,6 +431,22 @@ def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
     assert len(texts) == len(doubts)
 
 
+@pytest.mark.parametrize("brakes", [True, False])
+def test_an_arm_that_moves_is_stopped_at_once_where_it_can_be(brakes: bool) -> None:
+    listener = Listener(brakes=brakes)
+    listener.taught()
+    listener.called(Restore(name="tea"))
+
+    def who() -> str:
+        return next(one.stage for one in listener.told().actions if one.kind == "stop")
+
+    assert who() == "demonstrator"
+    listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1))
+    assert who() == ("executor" if brakes else "demonstrator")
+    listener.hear(verdict(STOPPED, "stopped, as asked; in the hand: cup"))
+    assert listener.notice.text == "Stopped, as you asked; in the hand is still the cup."
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("stage", ["perception", "planner", "executor"])
 def test_a_failure_says_what_is_wrong_and_what_helps(stage: str, language: Language) -> None:
@@ -484,7 +500,7 @@ def test_a_scripted_robot_takes_no_commands() -> None:
 
 def test_a_graph_without_objects_has_no_story() -> None:
     with pytest.raises(Refused, match="story: none of the stages camera has a setting `catalogue`; objects need one"):
-        Story({"camera": {}})
+        Story({"camera": {}}, {})
 
 
 # ------------------------------------------------------------------------------------------ languages
