@@ -28,6 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runner.contract import Refused
 from runner.live.live import Live
+from runner.page import viewer
 from runner.page.calls import PageCalls
 from runner.page.feed import Feed, shape
 from runner.page.guard import Guard, is_loopback, new_token
@@ -73,6 +74,8 @@ class Page:
         """JPEG by key."""
         self._past_photos: tuple[str, dict[str, Photo]] = ("", {})
         """Of the recording that was told again last."""
+        self._viewer_files: dict[str, bytes] = {}
+        """Of the viewer of the robot in 3D."""
         self._files: dict[str, bytes] = {}
         """What can be downloaded, by key."""
         self._news, self._looks = asyncio.Event(), asyncio.Event()
@@ -92,6 +95,8 @@ class Page:
             Route("/runs", self._runs),
             Route("/runs/{name}.mcap", self._download),
             Route("/runs/{name}/{language}.json", self._past),
+            Route("/runs/{name}.rrd", self._drawn),
+            Route("/viewer/{name}", self._viewer),
             Route("/runs/{name}/{key}.jpg", self._past_photo),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ]
@@ -236,6 +241,27 @@ class Page:
         if photo is None or name != request.path_params["name"]:
             return PlainTextResponse("this picture is not kept any more\n", 404)
         return Response(await run_in_threadpool(_jpeg, photo), media_type="image/jpeg")
+
+    async def _drawn(self, request: Request) -> Response:
+        """A recording for the viewer of the robot in 3D."""
+        try:
+            return Response(
+                await run_in_threadpool(viewer.drawn, self._recording(request)), media_type="application/octet-stream"
+            )
+        except Refused as refusal:
+            return PlainTextResponse(str(refusal), 422)
+
+    async def _viewer(self, request: Request) -> Response:
+        """A file of that viewer; they are large, and there once somebody has asked for one."""
+        name = request.path_params["name"]
+        if name not in viewer.FILES:
+            return PlainTextResponse(f"{name}: no such file; valid: {', '.join(viewer.FILES)}\n", 404)
+        try:
+            self._viewer_files = self._viewer_files or await run_in_threadpool(viewer.viewer_files)
+        except Refused as refusal:
+            return PlainTextResponse(str(refusal), 422)
+        headers = {"content-security-policy": viewer.policy(self._viewer_files["index.html"])}
+        return Response(self._viewer_files[name], media_type=viewer.FILES[name], headers=headers)
 
     def _recording(self, request: Request) -> Path:
         """The recording that is asked for; it must be one of the folder."""

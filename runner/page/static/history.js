@@ -62,7 +62,8 @@ function replayed(page, past) {
         <input type="range" aria-label=${page.say("moment")} aria-valuetext="${lasted(moment.seconds)}: ${moment.doing.text}"
           min="0" max=${past.moments.length - 1} .value=${String(past.at)} @input=${(event) => to(Number(event.target.value))}>
         <span class="quiet">${lasted(moment.seconds)} / ${lasted(past.moments.at(-1).seconds)}</span>
-      </section></div>
+      </section>
+      ${solid(page, past)}</div>
     <div class="said"><section class="doing" aria-labelledby="then"><h2 id="then">${page.say("then")}</h2>
       <p class="what">${moment.doing.text}</p>
       ${moment.doing.steps.length ? html`<ol class="steps">${moment.doing.steps.map((one, k) => html`<li
@@ -74,6 +75,17 @@ function replayed(page, past) {
     </section></div>
     ${statements(page, moment)}
   </div>`;
+}
+
+/** The robot and what it sees in 3D, in Rerun's viewer: large, so only once it is wanted. */
+function solid(page, past) {
+  const wanted = () => { past.solid = !past.solid; page.draw(); };
+  const drawing = new URL(`runs/${past.name}.rrd`, location.href).href.split("#")[0];
+  return html`<section class="solid" aria-label=${page.say("solid")}>
+    <button aria-expanded=${past.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
+    ${past.solid ? html`<iframe title=${page.say("solid")}
+      src="viewer/index.html?hide_welcome_screen&persist=0&url=${encodeURIComponent(drawing)}"></iframe>` : nothing}
+  </section>`;
 }
 
 /** Goes through the moments as they came, but waits for none of them long. */

@@ -73,7 +73,7 @@ function whole() {
       ${banner()}
       ${VIEWS[page.view](page)}
     </main>
-    <footer><span>${page.run?.name ?? ""}</span></footer>`;
+    <footer>${page.run ? html`<a href="#history/${page.run.name}">${page.run.name}</a>` : nothing}</footer>`;
 }
 
 function tab(name) {

@@ -147,6 +147,23 @@ def test_recordings_are_listed_and_can_be_downloaded(lamp: Lamp) -> None:
     assert status == 200
 
 
+def test_the_robot_in_3d_comes_from_the_same_address_and_calls_nobody_else(lamp: Lamp, page: Page) -> None:
+    path = urlsplit(lamp.url).path
+    status, html = asked(lamp.url, f"{path}viewer/index.html")
+    assert status == 200 and "re_viewer_bg.wasm" in html
+    assert asked(lamp.url, f"{path}viewer/other.wasm")[0] == 404
+    name = json.loads(asked(lamp.url, f"{path}runs")[1])[0]["name"]
+    status, reason = asked(lamp.url, f"{path}runs/{name}.rrd")
+    assert status == 422 and "names no views" in reason
+    called = list[str]()
+    page.on("requestfinished", lambda request: called.append(request.url))
+    page.goto(f"{page.url.partition('#')[0]}#history/{name}")
+    page.get_by_role("button", name="Robot in 3D").press("Enter")
+    viewer = page.frame_locator("iframe[title='Robot in 3D']")
+    expect(viewer.locator("canvas")).to_be_attached()
+    assert all(url.startswith(lamp.url) or url.startswith(("data:", "blob:")) for url in called)
+
+
 # ------------------------------------------------------------------------------------------ what is shown
 
 
