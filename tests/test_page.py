@@ -20,20 +20,31 @@ def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     process = start_graph(ROOT / "graphs" / "interactive.yaml", "world.seed=1", folder=tmp_path, options=["--page"])
-    printed = read_until(process, "processes are ready")
-    (url,) = re.findall(r"page: (\S+)", printed)
-    with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
-        teaches(page)
-        listed = runner("goals").communicate(timeout=60)[0]
-        assert (
-            listed.startswith("breakfast\n    6 objects: the ")
-            and "runner call demonstrator restore name=breakf" in listed
-        )
-        restores_and_stops(page)
-        tells_it_in_german(page)
-    process.terminate()
+    try:
+        printed = read_until(process, "processes are ready")
+        (url,) = re.findall(r"page: (\S+)", printed)
+        with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
+            teaches(page)
+            listed = runner("goals").communicate(timeout=60)[0]
+            assert listed.startswith("breakfast\n    6 objects: the ")
+            assert "runner call demonstrator restore name=breakfast ask=true" in listed
+            edits(page)
+            restores_and_stops(page)
+            tells_it_in_german(page)
+    finally:
+        process.terminate()
     run = finish(process, tmp_path, before=printed)
     assert "COMPLETE" in run.output
+
+
+def edits(page: Page) -> None:
+    page.locator(".cards summary").first.press("Enter")
+    page.get_by_role("button", name="Leave the sugar box out").press("Enter")
+    expect(page.locator(".cards")).to_contain_text("5 objects: ")
+    page.get_by_text("More").first.press("Enter")
+    page.get_by_label("New name").fill("brunch")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="brunch")).to_be_visible()
 
 
 def teaches(page: Page) -> None:

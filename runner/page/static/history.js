@@ -62,8 +62,7 @@ function replayed(page, past) {
         <input type="range" aria-label=${page.say("moment")} aria-valuetext="${lasted(moment.seconds)}: ${moment.doing.text}"
           min="0" max=${past.moments.length - 1} .value=${String(past.at)} @input=${(event) => to(Number(event.target.value))}>
         <span class="quiet">${lasted(moment.seconds)} / ${lasted(past.moments.at(-1).seconds)}</span>
-      </section>
-      ${solid(page, past)}</div>
+      </section></div>
     <div class="said"><section class="doing" aria-labelledby="then"><h2 id="then">${page.say("then")}</h2>
       <p class="what">${moment.doing.text}</p>
       ${moment.doing.steps.length ? html`<ol class="steps">${moment.doing.steps.map((one, k) => html`<li
@@ -74,6 +73,7 @@ function replayed(page, past) {
       <p class="quiet">${page.say("ask_engineer")} <code>runner why ${moment.message} ${past.name}.mcap</code></p>
     </section></div>
     ${statements(page, moment)}
+    ${solid(page, past)}
   </div>`;
 }
 

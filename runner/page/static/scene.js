@@ -34,7 +34,7 @@ export function view(page, view) {
       <svg viewBox="0 0 ${width} ${height}" aria-hidden="true">
         ${view.outlines.map((one) => svg`<path class="${one.surety} ${marked(page, one)}"
           d="M${one.points.map((point) => point.join(" ")).join("L")}Z"/>`)}
-        ${view.arrows.map((one, k) => arrow(one, k + Math.max(1, page.told.doing.step)))}
+        ${arrows(view.arrows, Math.max(1, page.told.doing.step))}
       </svg>
       ${labels(view.outlines).map(([one, x, y]) => html`<span
         class="name ${one.surety} ${marked(page, one)}"
@@ -49,14 +49,18 @@ function marked(page, {name}) {
   return name === page.marked || name === page.told.question?.about ? "marked" : "";
 }
 
-/** What will be moved: a bow from where it is to where it will be, and the number of the step. */
-function arrow({start: [x0, y0], end: [x1, y1]}, step) {
-  const [x, y] = [(x0 + x1) / 2, Math.min(y0, y1) - BOW * (1 + Math.hypot(x1 - x0, y1 - y0) / 300)];
-  const turn = (Math.atan2(y1 - y, x1 - x) * 180) / Math.PI;
-  return svg`<g class="arrow"><path d="M${x0} ${y0}Q${x} ${y} ${x1} ${y1}"/>
-    <path class="head" d="M0 0L-14 -7L-14 7Z" transform="translate(${x1} ${y1}) rotate(${turn})"/>
-    <circle cx=${(x0 + 2 * x + x1) / 4} cy=${(y0 + 2 * y + y1) / 4} r="11"/>
-    <text x=${(x0 + 2 * x + x1) / 4} y=${(y0 + 2 * y + y1) / 4}>${step}</text></g>`;
+/** What will be moved: bows from where things are to where they will be, and on each thing the number of its step. */
+function arrows(found, first) {
+  return [
+    ...found.map(({start: [x0, y0], end: [x1, y1]}) => {
+      const [x, y] = [(x0 + x1) / 2, Math.min(y0, y1) - BOW * (1 + Math.hypot(x1 - x0, y1 - y0) / 300)];
+      const turn = (Math.atan2(y1 - y, x1 - x) * 180) / Math.PI;
+      return svg`<g class="arrow"><path d="M${x0} ${y0}Q${x} ${y} ${x1} ${y1}"/>
+        <path class="head" d="M0 0L-14 -7L-14 7Z" transform="translate(${x1} ${y1}) rotate(${turn})"/></g>`;
+    }),
+    ...found.map(({start: [x, y]}, k) => svg`<g class="step"><circle cx=${x} cy=${y} r="12"/>
+      <text x=${x} y=${y}>${k + first}</text></g>`),
+  ];
 }
 
 /** Where each name stands, its middle in pixels of the picture: over its outline, under it where other names are. */
