@@ -3,7 +3,7 @@
 Runs a graph with a camera of five pictures a second and one stage a core that computes all the time, and prints
 
 * the time from opening the page's address to its first paint, in a browser without a cache: median and slowest;
-* how far the picture on the page is behind the recorder: from when that had it to when the browser has painted it;
+* how far the picture on the page is behind the camera: from when it was taken to when the browser has painted it;
 * what the graph computes a second, and what the page's server takes of a core, without a page process, with one that
   nobody has open, with one open page and with ten. Open pages are connections that take everything and every picture:
   what browsers draw would be drawn on other machines. Every round measures each once, in turns.

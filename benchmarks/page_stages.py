@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,17 +33,20 @@ class Grinder(Stage):
 
 
 class PictureStory:
-    """The newest picture with eight outlines; its key says when it was recorded."""
+    """The newest picture with eight outlines; its key says when it was taken."""
 
     hears: tuple[type[Message], ...] = (Picture,)
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
         self._photo: Photo | None = None
 
     def hear(self, heard: Heard) -> None:
         """Takes a picture."""
         assert isinstance(heard.message, Picture)
-        self._photo = Photo(str(heard.time_ns), heard.message.rgb)
+        self._photo = Photo(str(heard.message.taken_ns), heard.message.rgb)
+
+    def recall(self) -> None:
+        """Nothing is kept."""
 
     def tell(self, language: Language) -> Told:
         """The picture."""

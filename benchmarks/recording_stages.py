@@ -21,6 +21,8 @@ class Picture(Message, frozen=True, kw_only=True):
     rgb: Annotated[NDArray[np.uint8], Spec("uint8", (480, 640, 3))]
     depth: Annotated[NDArray[np.float32], Spec("float32", (480, 640))]
     """Metres."""
+    taken_ns: int = 0
+    """Nanoseconds since the epoch."""
 
 
 class Word(Message, frozen=True, kw_only=True):
@@ -60,7 +62,7 @@ class Camera(Stage):
     def source(self, ctx: Context) -> Iterator[Picture | Finished]:
         """Noise, so that nothing is gained by compressing it."""
         for _ in beats(self._pace):
-            yield Picture(rgb=self._rgb, depth=self._depth)
+            yield Picture(rgb=self._rgb, depth=self._depth, taken_ns=time.time_ns())
         time.sleep(_GRACE_SECONDS)
         yield Finished(code=0, reason="all sent")
 

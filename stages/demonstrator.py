@@ -12,16 +12,20 @@ import msgspec
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import (
+    Answer,
     Arrangement,
     Asked,
     Assertion,
-    Forget,
+    Go,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Observation,
     Outcome,
+    Pause,
     Plan,
+    Question,
     Recover,
     Restore,
     RobotState,
@@ -40,6 +44,8 @@ from stages.planning.hiding import hiders
 from stages.planning.pddl import goal_pddl
 from stages.planning.placements import Scene
 from stages.scene.catalogue import Catalogue
+from stages.scene.doubts import corrected, open_doubt
+from stages.scene.goals import check_name
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import Stances, standing_of
 from stages.scene.virtual import satisfied, without
@@ -53,6 +59,8 @@ class Phase(Enum):
     PLANNING = "a plan"
     TRANSFERRING = "the outcome of a transfer"
     RECOVERING = "the arm to come home"
+    ASKING = "an answer"
+    READY = "go"
     IDLE = "a command"
     DONE = "nothing more"
 
@@ -102,6 +110,19 @@ class State:
     """Somebody asked to stop: what is waited for is the last."""
     halted: bool = False
     """The arm stands where it was stopped."""
+    ask: bool = False
+    """Somebody is there to be asked what a look leaves open."""
+    asked: int = 0
+    """Questions so far, of all tasks."""
+    question: Question | None = None
+    shown: tuple[SceneGraph, Observation] | None = None
+    """What it was asked about."""
+    answers: Mapping[str, str] = field(default_factory=dict[str, str])
+    """By key of the doubt. Never changed, only replaced."""
+    waits: Literal["", "asked", "paused"] = ""
+    """Why the next plan waits for go."""
+    plan: Plan | None = None
+    """The one that waits."""
 
 
 class Demonstrator(Stage):
@@ -147,7 +168,7 @@ class Demonstrator(Stage):
             ):
                 if getattr(self, name) < least:
                     raise Refused(f"demonstrator.{name}={getattr(self, name)}: must be {least} or more")
-            _refuse_odd_name(f"demonstrator.goal_name={self.goal_name!r}", self.goal_name)
+            check_name(f"demonstrator.goal_name={self.goal_name!r}", self.goal_name)
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -164,23 +185,16 @@ class Demonstrator(Stage):
 
     def on_teach(self, teach: Teach, ctx: Context) -> LookRequest | Recover:
         """Looks at what is to be remembered."""
-        _refuse_odd_name(f"name={teach.name!r}", teach.name)
-        self._begin(teach.name, None)
+        check_name(f"name={teach.name!r}", teach.name)
+        self._begin(teach.name, None, ask=teach.ask)
         ctx.log(f'looks at the goal "{teach.name}"')
         return self._first_look(f"goal {teach.name}")
 
     def on_restore(self, restore: Restore, ctx: Context) -> LookRequest | Recover:
         """Looks at what there is to do for a goal."""
-        self._begin(restore.name, self._goal(restore.name))
+        self._begin(restore.name, self._goal(restore.name), ask=restore.ask)
         ctx.log(f'restores the goal "{restore.name}"')
         return self._first_look(f"restore {restore.name}")
-
-    def on_forget(self, forget: Forget, ctx: Context) -> None:
-        """Strikes a goal off; one that is being restored still is."""
-        self._goal(forget.name)
-        goals = {name: goal for name, goal in self._state.goals.items() if name != forget.name}
-        self._state = replace(self._state, goals=goals)
-        ctx.log(f'goal "{forget.name}" forgotten')
 
     def on_look(self, look: Look, ctx: Context) -> LookRequest | Recover:
         """Looks without a goal."""
@@ -188,12 +202,44 @@ class Demonstrator(Stage):
         ctx.log("looks at what is there")
         return self._first_look("look")
 
-    def on_stop(self, stop: Stop, ctx: Context) -> None:
+    def on_stop(self, stop: Stop, ctx: Context) -> Verdict | None:
         """Lets what is under way come to its end, and nothing follow it."""
-        if self._state.phase in (Phase.IDLE, Phase.DONE):
-            raise Refused("nothing is under way")
+        self._refuse_idle()
+        if self._state.phase in (Phase.ASKING, Phase.READY):
+            return self._stopped(ctx)
         self._state = replace(self._state, stopping=True)
         ctx.log(f"stops after {self._state.phase.value}")
+        return None
+
+    def on_pause(self, pause: Pause, ctx: Context) -> None:
+        """Has the next plan wait."""
+        self._refuse_idle()
+        self._state = replace(self._state, waits="paused")
+        ctx.log("pauses before the next transfer")
+
+    def on_go(self, go: Go, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
+        """Carries out the plan that waits; after a pause, in which people move things, only after another look."""
+        state = self._state
+        if not state.waits:
+            raise Refused("nothing waits for go")
+        self._state = replace(state, waits="", plan=None)
+        if state.plan is None:
+            return None
+        return self._proceed(state.plan, ctx) if state.waits == "asked" else self._look(state.purpose)
+
+    def on_answer(
+        self, answer: Answer, ctx: Context
+    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict | Question]:
+        """Goes on with what was answered."""
+        state = self._state
+        if state.question is None or state.question.number != answer.question:
+            now = "nothing is asked now" if state.question is None else f"{state.question.number} is asked now"
+            raise Refused(f"question={answer.question}: {now}")
+        doubt = state.question.doubt
+        if answer.choice not in doubt.choices:
+            raise Refused(f"choice={answer.choice!r}: valid: {', '.join(doubt.choices)}")
+        ctx.log(f"{doubt.key}: {answer.choice}")
+        return self._answered(doubt.key, answer.choice, ctx)
 
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
         """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
@@ -201,7 +247,7 @@ class Demonstrator(Stage):
 
     def on_scene_graph(
         self, scene_graph: SceneGraph, observation: Observation, ctx: Context
-    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict]:
+    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict | Question]:
         """Remembers the goal, or compares the scene with it and asks for a plan where they differ."""
         if self._state.phase is not Phase.LOOKING:
             return
@@ -210,6 +256,34 @@ class Demonstrator(Stage):
             return
         if not self._state.goal_name:
             self._state = replace(self._state, phase=Phase.IDLE)
+            return
+        yield from self._consider(scene_graph, observation, ctx)
+
+    def _answered(
+        self, key: str, choice: str, ctx: Context
+    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict | Question]:
+        state = self._state
+        assert state.shown is not None  # A question is about a scene.
+        self._state = replace(state, question=None, shown=None)
+        if choice == "again":
+            yield self._look(state.purpose)
+        else:
+            self._state = replace(self._state, answers={**state.answers, key: choice})
+            yield from self._consider(*state.shown, ctx)
+
+    def _consider(
+        self, scene_graph: SceneGraph, observation: Observation, ctx: Context
+    ) -> Iterator[LookRequest | Goal | Arrangement | Task | Verdict | Question]:
+        """Asks about what the scene leaves open, where somebody is there; else acts on the scene."""
+        state, shown = self._state, (scene_graph, observation)
+        scene_graph = corrected(scene_graph, state.answers, self._memory.related)
+        doubt = open_doubt(scene_graph, state.goal, state.answers) if state.ask else None
+        if doubt is not None:
+            question = Question(number=state.asked + 1, doubt=doubt)
+            choices = "|".join(doubt.choices)
+            ctx.log(f"asks: {doubt.key}; runner call demonstrator answer question={question.number} choice={choices}")
+            self._state = replace(state, phase=Phase.ASKING, question=question, shown=shown, asked=question.number)
+            yield question
             return
         scene = self._memory.complete(scene_graph, self._state.known, observation)
         self._state = replace(
@@ -237,7 +311,9 @@ class Demonstrator(Stage):
         if self._state.stopping:
             return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
-        return self._proceed(plan, ctx) if plan.status == "solved" else self._without_plan(plan, ctx)
+        if plan.status == "solved":
+            return self._wait(plan, ctx) if self._state.waits else self._proceed(plan, ctx)
+        return self._without_plan(plan, ctx)
 
     def _without_plan(self, plan: Plan, ctx: Context) -> LookRequest | Task | Verdict:
         """Looks again, or behind something else."""
@@ -285,11 +361,19 @@ class Demonstrator(Stage):
             raise Refused(f"name={name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
         return goals[name]
 
-    def _begin(self, name: str, goal: SceneGraph | None) -> None:
+    def _refuse_idle(self) -> None:
+        if self._state.phase in (Phase.IDLE, Phase.DONE):
+            raise Refused("nothing is under way")
+
+    def _begin(self, name: str, goal: SceneGraph | None, *, ask: bool = False) -> None:
         """Starts from anew with a goal, or with one that is yet to be seen."""
         if self._state.phase is not Phase.IDLE:
             raise Refused(f"busy: waits for {self._state.phase.value}; ask again after the verdict")
-        self._state = State(goals=self._state.goals, goal_name=name, goal=goal, halted=self._state.halted)
+        waits = "asked" if ask and goal is not None else ""
+        state = self._state
+        self._state = State(
+            goals=state.goals, goal_name=name, goal=goal, halted=state.halted, ask=ask, asked=state.asked, waits=waits
+        )
 
     def _first_look(self, purpose: str) -> LookRequest | Recover:
         """Looks, once the arm is out of the way."""
@@ -419,6 +503,10 @@ class Demonstrator(Stage):
         failures = self._state.failures
         return tuple(sorted({key for key in failures if failures.count(key) >= self._config.tries}))
 
+    def _wait(self, plan: Plan, ctx: Context) -> None:
+        self._state = replace(self._state, phase=Phase.READY, plan=plan)
+        ctx.log(f"waits for go: {', '.join(transfer.key for transfer in plan.transfers)}")
+
     def _proceed(self, plan: Plan, ctx: Context) -> TransferRequest | Verdict:
         """Requests the first transfer of a solved plan, unless plans have been replaced too often."""
         state = self._state
@@ -451,7 +539,8 @@ class Demonstrator(Stage):
         goal = state.whole or state.goal
         if goal is not None and state.scene is not None:
             held, violated = satisfied(goal, state.scene, self._catalogue)
-        self._state = replace(state, phase=Phase.DONE if self._config.scripted else Phase.IDLE)
+        phase = Phase.DONE if self._config.scripted else Phase.IDLE
+        self._state = replace(state, phase=phase, question=None, shown=None, waits="", plan=None)
         return Verdict(
             goal_name=state.goal_name,
             success=not failed_stage,
@@ -465,7 +554,15 @@ class Demonstrator(Stage):
         )
 
 
-class AskedDemonstrator(Demonstrator):
+class KeepingDemonstrator(Demonstrator):
+    """Knows the goals that are on disk, too."""
+
+    def on_kept(self, kept: Kept) -> None:
+        """Goals were read, or changed; one that is being restored stays as it is."""
+        self._state = replace(self._state, goals={goal.name: goal.scene for goal in kept.goals})
+
+
+class AskedDemonstrator(KeepingDemonstrator):
     """Does what a device is asked from outside as well as what is called."""
 
     def on_asked(self, asked: Asked, ctx: Context) -> LookRequest | Recover | Verdict:
@@ -487,12 +584,6 @@ class AskedDemonstrator(Demonstrator):
 
 def _names(scene: SceneGraph) -> set[str]:
     return {item.name for item in scene.objects}
-
-
-def _refuse_odd_name(place: str, name: str) -> None:
-    """Goals are written to files of their names."""
-    if not name.replace("-", "").replace("_", "").isalnum():
-        raise Refused(f"{place}: must consist of letters, digits, - and _ only")
 
 
 def change_of_plan(expected: Sequence[Transfer], planned: Sequence[Transfer]) -> str:

@@ -18,7 +18,7 @@ from stages.planning import search
 from stages.planning.hiding import uncovers
 from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
-from stages.planning.problem import TABLE, Problem, carriers, cycle
+from stages.planning.problem import TABLE, Problem, cycle, wanted
 from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
@@ -194,7 +194,7 @@ class Planner(Stage):
         current = Scene.of(task.current, self._stances)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
         placements = Placements(task.goal, self._stances)
-        targets = Targets(placements, self._config.workspace.of(self._robot), handling, carriers(task.goal))
+        targets = Targets(placements, self._config.workspace.of(self._robot), handling, wanted(task.goal))
         avoided = frozenset(task.avoid)
         because = ""
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)

@@ -13,6 +13,7 @@ from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose, SceneObject
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
+from stages.scene.doubts import doubts
 from stages.scene.relations import Tolerances
 from stages.scene.stance import Stances, Standing
 
@@ -30,6 +31,8 @@ class SceneGraphBuilder(Stage):
         radius: float = 0.04
         """Radius of the region in which an object counts as still beside the other, metres."""
         tolerances: Tolerances = field(default_factory=Tolerances)
+        doubts: bool = False
+        """Whether somebody is there to be asked what a look leaves open."""
 
         def __post_init__(self) -> None:
             """Refuses distances that are not positive."""
@@ -39,8 +42,8 @@ class SceneGraphBuilder(Stage):
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        catalogue = Catalogue.shared(config.catalogue)
-        self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
+        self._catalogue = Catalogue.shared(config.catalogue)
+        self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
     def on_scene_estimate(self, scene_estimate: SceneEstimate) -> SceneGraph:
         """The scene graph of an estimate; objects the catalogue does not hold are refused."""
@@ -64,6 +67,7 @@ class SceneGraphBuilder(Stage):
             scene_id=scene_estimate.scene_id,
             image_id=scene_estimate.image_id,
             support=scene_estimate.support,
+            doubts=doubts(scene_estimate, self._catalogue) if self._config.doubts else (),
         )
 
     def _stances_of(self, label: str) -> Stances:

@@ -1,5 +1,6 @@
 """The robot at somebody's command: a goal is taught, disturbed and restored from another terminal."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ def runner(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.timeout(1200)
 def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     command = (*RUNNER, "up", "graphs/interactive.yaml", "--set", "world.seed=1", "--recordings", str(tmp_path / "rec"))
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         printed = read_until(process, "processes are ready")
@@ -37,10 +39,15 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
         assert "every relation of the goal holds" in again.stdout
         idle = runner("call", "executor", "stop")
         assert (idle.returncode, "the arm is not under way" in idle.stderr) == (2, True)
+        renamed = runner("call", "goals", "rename", "name=breakfast", "to=brunch")
+        assert 'goal "breakfast" is now "brunch"' in renamed.stdout
         assert runner("down").returncode == 0
         printed += process.communicate(timeout=60)[0]
     assert process.returncode == 0, printed
     (recording,) = (tmp_path / "rec").glob("interactive-*.mcap")
     assert f"recording {recording}: COMPLETE" in printed
+    kept = runner("goals", "--graph", "graphs/interactive.yaml").stdout
+    assert kept.startswith("brunch\n    6 objects: the ") and "runner call goals forget name=brunch" in kept
+    shutil.rmtree(tmp_path / "scene-programming")
     replay = runner("replay", str(recording), "--verify")
     assert replay.returncode == 0, replay.stdout + replay.stderr

@@ -18,21 +18,33 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.timeout(600)
 def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     process = start_graph(ROOT / "graphs" / "interactive.yaml", "world.seed=1", folder=tmp_path, options=["--page"])
-    printed = read_until(process, "processes are ready")
-    (url,) = re.findall(r"page: (\S+)", printed)
-    with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
-        teaches(page)
-        listed = runner("goals").communicate(timeout=60)[0]
-        assert (
-            listed.startswith("breakfast\n    6 objects: the ")
-            and "runner call demonstrator restore name=breakf" in listed
-        )
-        restores_and_stops(page)
-        tells_it_in_german(page)
-    process.terminate()
+    try:
+        printed = read_until(process, "processes are ready")
+        (url,) = re.findall(r"page: (\S+)", printed)
+        with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
+            teaches(page)
+            listed = runner("goals").communicate(timeout=60)[0]
+            assert listed.startswith("breakfast\n    6 objects: the ")
+            assert "runner call demonstrator restore name=breakfast ask=true" in listed
+            edits(page)
+            restores_and_stops(page)
+            tells_it_in_german(page)
+    finally:
+        process.terminate()
     run = finish(process, tmp_path, before=printed)
     assert "COMPLETE" in run.output
+
+
+def edits(page: Page) -> None:
+    page.locator(".cards summary").first.press("Enter")
+    page.get_by_role("button", name="Leave the sugar box out").press("Enter")
+    expect(page.locator(".cards")).to_contain_text("5 objects: ")
+    page.get_by_text("More").first.press("Enter")
+    page.get_by_label("New name").fill("brunch")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="brunch")).to_be_visible()
 
 
 def teaches(page: Page) -> None:
@@ -55,6 +67,10 @@ def restores_and_stops(page: Page) -> None:
         page.keyboard.press(key)
     expect(page.get_by_text("What the robot saw before something was moved")).to_be_visible()
     page.get_by_role("button", name="Restore").click()
+    expect(page.locator(".what")).to_have_text(re.compile(r"Waits for your go; left to move: \d, about 1 min"))
+    expect(page.locator(".arrow")).not_to_have_count(0)
+    assert faults(page) == []
+    page.get_by_role("button", name="Go", exact=True).press("Enter")
     expect(page.locator(".what")).to_have_text("Puts the cup on the table")
     expect(page.get_by_text(re.compile(r"^Step 1 of \d"))).to_be_visible()
     expect(page.get_by_role("button", name="Restore")).to_be_disabled()
@@ -69,6 +85,6 @@ def tells_it_in_german(page: Page) -> None:
     page.get_by_role("button", name="Noch einmal hinsehen").click()
     expect(page.get_by_text("Erkennt, was da ist")).to_be_visible()
     expect(page.get_by_text("Der Roboter wartet auf Sie")).to_be_visible()
-    expect(page.get_by_text("Das Tablett ist auf dem Tisch.")).to_be_visible()
+    expect(page.get_by_role("region", name="Was da ist").get_by_text("Das Tablett ist auf dem Tisch.")).to_be_visible()
     page.get_by_role("link", name="Verlauf").click()
     expect(page.get_by_text("wird geschrieben")).to_be_visible()

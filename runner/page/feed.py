@@ -21,7 +21,7 @@ class Feed:
 
     def put(self, name: str, value: Any) -> None:
         """Replaces what has that name."""
-        encoded = msgspec.json.encode({"name": name, "value": value}, enc_hook=_shape)
+        encoded = msgspec.json.encode({"name": name, "value": value}, enc_hook=shape)
         if self._values.get(name) != encoded:
             self._values[name] = encoded
             self.wake()
@@ -45,6 +45,6 @@ class Feed:
             await changed.wait()
 
 
-def _shape(array: Any) -> list[int]:
-    """Of pictures only their size is sent: H, W, 3."""
+def shape(array: Any) -> list[int]:
+    """Of pictures and files only their size is sent: H, W, 3, or the number of bytes."""
     return list(array.shape)

@@ -15,7 +15,7 @@ from runner.contract import Refused
 
 TOKEN_CHARACTERS = 16
 """Of one that somebody chooses, at least."""
-_HEADERS = {
+_HEADERS = {  # unless an answer has its own
     b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; "
     b"base-uri 'none'; form-action 'none'",
     b"referrer-policy": b"no-referrer",
@@ -69,7 +69,8 @@ class Guard:
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message["headers"] = [*message["headers"], *_HEADERS.items()]
+            own = {name for name, _ in message["headers"]}
+            message["headers"] += [header for header in _HEADERS.items() if header[0] not in own]
         await send(message)
 
     return sending

@@ -19,6 +19,7 @@ import uvicorn
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -27,10 +28,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runner.contract import Refused
 from runner.live.live import Live
+from runner.page import viewer
 from runner.page.calls import PageCalls
-from runner.page.feed import Feed
+from runner.page.feed import Feed, shape
 from runner.page.guard import Guard, is_loopback, new_token
 from runner.page.history import past_runs
+from runner.page.past import moments
 from runner.page.story import Language, Photo
 from runner.page.watch import Watch
 from runner.supervise.calls import CallRequest
@@ -69,6 +72,12 @@ class Page:
         """By every open page."""
         self._photos: dict[str, bytes] = {}
         """JPEG by key."""
+        self._past_photos: tuple[str, dict[str, Photo]] = ("", {})
+        """Of the recording that was told again last."""
+        self._viewer_files: dict[str, bytes] = {}
+        """Of the viewer of the robot in 3D."""
+        self._files: dict[str, bytes] = {}
+        """What can be downloaded, by key."""
         self._news, self._looks = asyncio.Event(), asyncio.Event()
         self._ended = threading.Event()
         self._ready = False
@@ -82,8 +91,13 @@ class Page:
             WebSocketRoute("/live", self._show),
             Route("/call", self._call, methods=["POST"]),
             Route("/photo/{key}.jpg", self._photo),
+            Route("/file/{key}", self._file),
             Route("/runs", self._runs),
             Route("/runs/{name}.mcap", self._download),
+            Route("/runs/{name}/{language}.json", self._past),
+            Route("/runs/{name}.rrd", self._drawn),
+            Route("/viewer/{name}", self._viewer),
+            Route("/runs/{name}/{key}.jpg", self._past_photo),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ]
 
@@ -92,7 +106,7 @@ class Page:
         self._watch.start()
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(work) for work in (self._tell(), self._ask_how_it_is())]
+                tasks = [group.create_task(work) for work in (self._tell(), self._ask_how_it_is(), self._listen())]
                 while await run_in_threadpool(is_alive, self._entry):
                     await asyncio.sleep(STATUS_SECONDS)
                 for task in tasks:
@@ -148,10 +162,18 @@ class Page:
             for language in languages:
                 told = await run_in_threadpool(self._watch.tell, language)
                 await run_in_threadpool(self._keep_photos, told.photos)
+                self._files = {file.key: file.data.tobytes() for file in told.files}
                 self._feed.put(f"told {language}", told)
             if self._an_engineer_looks:
                 self._feed.put("log", list(self._watch.lines))
             await asyncio.sleep(0.05)
+
+    async def _listen(self) -> None:
+        """Hears what is sent while somebody looks; where the run does not answer, it is asked again."""
+        while True:
+            await self._looks.wait()
+            await run_in_threadpool(self._watch.listen, self._entry)
+            await asyncio.sleep(STATUS_SECONDS)
 
     async def _ask_how_it_is(self) -> None:
         """Asks until every process is ready, and from then on while an engineer looks."""
@@ -179,6 +201,12 @@ class Page:
             return PlainTextResponse("this picture is not kept any more\n", 404)
         return Response(jpeg, media_type="image/jpeg")
 
+    async def _file(self, request: Request) -> Response:
+        data = self._files.get(request.path_params["key"])
+        if data is None:
+            return PlainTextResponse("this file is not kept any more\n", 404)
+        return Response(data, media_type="application/octet-stream")
+
     # ------------------------------------------------------------------------------------------ what is asked
 
     async def _call(self, request: Request) -> Response:
@@ -194,10 +222,53 @@ class Page:
         return Response(msgspec.json.encode(found), media_type="application/json")
 
     async def _download(self, request: Request) -> Response:
+        path = self._recording(request)
+        return FileResponse(path, filename=path.name)
+
+    async def _past(self, request: Request) -> Response:
+        """A recording told again; its pictures are kept until another one is."""
+        path, language = self._recording(request), request.path_params["language"]
+        try:
+            found, photos = await run_in_threadpool(moments, path, msgspec.convert(language, Language))
+        except (Refused, msgspec.ValidationError) as refusal:
+            return PlainTextResponse(str(refusal), 422)
+        self._past_photos = (path.stem, photos)
+        return Response(msgspec.json.encode(found, enc_hook=shape), media_type="application/json")
+
+    async def _past_photo(self, request: Request) -> Response:
+        name, photos = self._past_photos
+        photo = photos.get(request.path_params["key"])
+        if photo is None or name != request.path_params["name"]:
+            return PlainTextResponse("this picture is not kept any more\n", 404)
+        return Response(await run_in_threadpool(_jpeg, photo), media_type="image/jpeg")
+
+    async def _drawn(self, request: Request) -> Response:
+        """A recording for the viewer of the robot in 3D."""
+        try:
+            return Response(
+                await run_in_threadpool(viewer.drawn, self._recording(request)), media_type="application/octet-stream"
+            )
+        except Refused as refusal:
+            return PlainTextResponse(str(refusal), 422)
+
+    async def _viewer(self, request: Request) -> Response:
+        """A file of that viewer; they are large, and there once somebody has asked for one."""
+        name = request.path_params["name"]
+        if name not in viewer.FILES:
+            return PlainTextResponse(f"{name}: no such file; valid: {', '.join(viewer.FILES)}\n", 404)
+        try:
+            self._viewer_files = self._viewer_files or await run_in_threadpool(viewer.viewer_files)
+        except Refused as refusal:
+            return PlainTextResponse(str(refusal), 422)
+        headers = {"content-security-policy": viewer.policy(self._viewer_files["index.html"])}
+        return Response(self._viewer_files[name], media_type=viewer.FILES[name], headers=headers)
+
+    def _recording(self, request: Request) -> Path:
+        """The recording that is asked for; it must be one of the folder."""
         name = request.path_params["name"]
         if name not in {path.stem for path in self._folder.glob("*.mcap")}:
-            return PlainTextResponse(f"{name}: no such recording\n", 404)
-        return FileResponse(self._folder / f"{name}.mcap", filename=f"{name}.mcap")
+            raise HTTPException(404, f"{name}: no such recording\n")
+        return self._folder / f"{name}.mcap"
 
     @property
     def _folder(self) -> Path:

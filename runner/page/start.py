@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-from collections.abc import Generator
+import threading
+from collections import deque
+from collections.abc import Callable, Generator
 from importlib.util import find_spec
 
 from runner.contract import Refused
@@ -21,10 +23,13 @@ def require_page() -> None:
 
 
 @contextlib.contextmanager
-def page_beside(run: str) -> Generator[None]:
-    """Serves the page of a run meanwhile. It prints its address on this terminal: a file could be read by others."""
+def page_beside(run: str, say: Callable[[str], object]) -> Generator[None]:
+    """Serves the page of a run meanwhile; ``say`` gets what it prints, its address above all."""
     command = bound([sys.executable, "-m", "runner.cli", "page", "--run", run])
-    page = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0)
+    page = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0)
+    assert page.stdout is not None
+    lines = map(str.rstrip, page.stdout)
+    threading.Thread(target=lambda: deque(map(say, lines), maxlen=0), name="page", daemon=True).start()
     try:
         yield
     finally:

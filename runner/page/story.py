@@ -7,7 +7,7 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -34,6 +34,18 @@ class Photo:
 
 
 @dataclass(frozen=True, slots=True)
+class File:
+    """Something to be downloaded; equal keys are equal files."""
+
+    key: str
+    """Letters, digits, ``.``, ``-`` and ``_``."""
+    name: str
+    label: str
+    data: NDArray[np.uint8]
+    """N bytes."""
+
+
+@dataclass(frozen=True, slots=True)
 class Outline:
     """Something seen in a picture."""
 
@@ -48,12 +60,23 @@ class Outline:
 
 
 @dataclass(frozen=True, slots=True)
+class Arrow:
+    """Something that will be moved in a picture; from and to as x and y in pixels."""
+
+    label: str
+    start: tuple[int, int]
+    end: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
 class View:
     """The newest picture with what was seen in it."""
 
     photo: Photo
     caption: str
     outlines: tuple[Outline, ...] = ()
+    arrows: tuple[Arrow, ...] = ()
+    """In the order in which things will be moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +98,8 @@ class Ask:
     hint: str = ""
     pattern: str = ""
     """Regular expression that the whole text must match; anything by default."""
+    kind: Literal["text", "file"] = "text"
+    """A file is sent as base64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +120,14 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
+class Line:
+    """One thing that a card says, with what can be done about it."""
+
+    text: str
+    actions: tuple[Action, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Card:
     """Something that is kept, with what can be done with it."""
 
@@ -103,6 +136,12 @@ class Card:
     text: str
     photo: Photo | None
     actions: tuple[Action, ...]
+    more: tuple[Action, ...] = ()
+    """What is done less often."""
+    lines: tuple[Line, ...] = ()
+    """What it holds, one by one."""
+    lines_title: str = ""
+    file: File | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +184,18 @@ class Doing:
     """The one of them that is at work or comes next, from 1; 0 where there are none."""
     since_ns: int = 0
     """When it began, nanoseconds since the epoch."""
+    expected_s: float = 0.0
+    """How long it will probably take from then on, seconds; 0 where nobody knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What the person is asked: nothing goes on until one of the answers is given."""
+
+    text: str
+    answers: tuple[Action, ...]
+    about: str = ""
+    """Names an outline, or is empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +205,11 @@ class Notice:
     good: bool
     text: str
     help: tuple[str, ...] = ()
-    """What the person can do about it."""
+    """What is wrong, and what the person can do about it."""
     message: str = ""
-    """Id of the message that said so, for the engineer."""
+    """Id of the message that said so."""
+    tried: tuple[str, ...] = ()
+    """What was tried in vain, under a title that comes first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +217,7 @@ class Told:
     """All that there is to say now."""
 
     doing: Doing
+    question: Question | None = None
     notice: Notice | None = None
     view: View | None = None
     statements: tuple[Statement, ...] = ()
@@ -173,12 +227,19 @@ class Told:
     cards_hint: str = ""
     """Shown where there are no cards."""
     cards: tuple[Card, ...] = ()
+    cards_actions: tuple[Action, ...] = ()
+    """What can be done to have one more."""
 
     @property
     def photos(self) -> list[Photo]:
         """All pictures that are told of."""
         found = [card.photo for card in self.cards] + [self.view.photo if self.view else None]
         return [photo for photo in found if photo is not None]
+
+    @property
+    def files(self) -> list[File]:
+        """All files that are told of."""
+        return [card.file for card in self.cards if card.file is not None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +260,17 @@ class Story(Protocol):
     hears: tuple[type[Message], ...]
     """The messages that it follows; the others are not read."""
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
-        """``configs`` holds every stage's settings by stage name, as the graph runs with them."""
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
+        """``configs`` holds every stage's settings by stage name, as the graph runs with them, and ``commands`` the
+        names of what it can be asked."""
         ...
 
     def hear(self, heard: Heard) -> None:
         """Takes a message, in recorded order."""
+        ...
+
+    def recall(self) -> None:
+        """Takes what is kept beyond runs, where there is no run to hear it from."""
         ...
 
     def tell(self, language: Language) -> Told:
@@ -214,4 +280,6 @@ class Story(Protocol):
 
 def load_story(graph: Graph) -> Story | None:
     """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""
-    return None if graph.story is None else graph.load("story", graph.story)
+    if graph.story is None:
+        return None
+    return graph.load("story", graph.story, {name: tuple(node.type.commands) for name, node in graph.nodes.items()})

@@ -1,7 +1,8 @@
-"""Follows the recording of a run while somebody looks at the page, and keeps what there is to tell.
+"""Follows a run while somebody looks at the page, and keeps what there is to tell.
 
-Like `runner view` it reads what is on the disk: however slow a page is, the graph never waits for it. While nobody
-looks, nothing is read.
+Like `runner view` it reads what is on the disk: however slow a page is, the graph never waits for it. Once it has read
+all, it hears messages at the gateway too, where they are some tenths of a second sooner; what is dropped there it reads
+later. While nobody looks, nothing is read or heard.
 """
 
 from __future__ import annotations
@@ -16,28 +17,41 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-from runner.contract import Message
+from runner.contract import Message, Refused
 from runner.graph.graph import Graph, graph_from_json
+from runner.live.live import Live
 from runner.message.codec import CodecError, Envelope, LogLine, open_envelope, unpack
+from runner.message.ids import Recent
 from runner.page.story import Doing, Heard, Language, Story, Told, load_story
 from runner.recording.container import POLL_SECONDS, Container, Entry, Growing, open_file
 from runner.recording.recording import LOG, RUN
+from runner.supervise.registry import Entry as Run
 
+KEPT_IDS = 1000
 KEPT_LINES = 300
 """Log lines that a page shows."""
+NOTHING = Told(Doing(""))
+"""What is told of a graph that names nobody to tell its story."""
 
 
 class Watch:
     """The story and the newest log lines of one run, as far as they have been read."""
 
     def __init__(self, recording: Path, changed: Callable[[], object], stopped: Callable[[], bool]) -> None:
-        """``changed`` is called, on another thread, after each record that changes something."""
+        """``changed`` is called, on the thread that reads, after each record that changes something."""
+        self.newest: Heard | None = None
+        self.began_ns = 0
+        """When the first record was made, nanoseconds since the epoch."""
         self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
         self._recording = recording
         self._changed = changed
         self._stopped = stopped
         self._looked_at = threading.Event()
         self._telling = threading.Lock()
+        self._caught_up = False
+        """Whether all was read that there is: before, what is sent now would be told too soon."""
+        self._taken = Recent[str, None](KEPT_IDS)
+        """Ids of what was heard or read: each may come twice."""
         self._story: Story | None = None
         self._prepared = False
         self._heard: dict[str, type[Message]] = {}
@@ -50,18 +64,30 @@ class Watch:
     def look(self, somebody: bool) -> None:
         """Goes on where somebody looks, and rests where nobody does."""
         self._looked_at.set() if somebody else self._looked_at.clear()
+        self._caught_up &= somebody
+
+    def listen(self, entry: Run) -> None:
+        """Hears what is sent until nobody looks, or the run does not answer any more."""
+        while not (self._prepared or self._stopped()):
+            time.sleep(POLL_SECONDS)
+        with contextlib.suppress(Refused), Live(entry) as live:
+            for packets in live.overheard(self._heard):
+                for packet in packets if self._caught_up else ():
+                    self._hear(self._heard[packet.key.removeprefix("m/")], packet.payload, time.time_ns())
+                if not self._looked_at.is_set() or self._stopped():
+                    return
 
     def tell(self, language: Language) -> Told:
         """What there is to say now."""
         with self._telling:
-            return self._story.tell(language) if self._story else Told(Doing(""))
+            return self._story.tell(language) if self._story else NOTHING
 
     def read(self) -> None:
         """Reads until the run ends, or as far as it is there once it is to stop."""
         while not self._recording.exists() and not self._stopped():
             time.sleep(POLL_SECONDS)
         with open_file(self._recording) as file:
-            for record in Container(Growing(file, self._rest), str(self._recording)):
+            for record in Container(Growing(file, self._at_end), str(self._recording)):
                 self._take(record)
                 self._rest()
 
@@ -71,7 +97,13 @@ class Watch:
             pass
         return self._stopped()
 
+    def _at_end(self) -> bool:
+        self._caught_up = self._prepared and self._looked_at.is_set()
+        return self._rest()
+
     def _take(self, record: Entry | Metadata) -> None:
+        if not isinstance(record, Metadata):
+            self.began_ns = self.began_ns or record.message.log_time
         if isinstance(record, Metadata):
             if record.name == RUN:
                 self._prepare(graph_from_json(record.metadata["graph"], str(self._recording)))
@@ -81,8 +113,7 @@ class Watch:
                 self.lines.append(unpack(LogLine, record.message.data))
                 self._changed()
         elif (kind := self._heard.get(record.topic)) is not None:
-            self._hear(kind, record)
-            self._changed()
+            self._hear(kind, record.message.data, record.message.log_time)
 
     def _prepare(self, graph: Graph) -> None:
         story = load_story(graph)
@@ -90,16 +121,21 @@ class Watch:
             self._heard = {topic: kind for topic, kind in graph.topics().items() if issubclass(kind, story.hears)}
         self._story, self._prepared = story, True
 
-    def _hear(self, kind: type[Message], entry: Entry) -> None:
+    def _hear(self, kind: type[Message], payload: bytes, time_ns: int) -> None:
         """What cannot be told is named on stderr and left out: the rest is still worth knowing."""
         assert self._story is not None
         try:
-            sealed = unpack(Envelope, entry.message.data)
-            heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, entry.message.log_time)
+            sealed = unpack(Envelope, payload)
             with self._telling:
+                if sealed.id in self._taken:
+                    return
+                self._taken[sealed.id] = None
+                heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, time_ns)
                 self._story.hear(heard)
+            self.newest = heard
+            self._changed()
         except Exception as error:
-            print(f"{entry.topic} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
+            print(f"a {kind.__name__} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
 
 
 def told_so_far(recording: Path, language: Language) -> Told:
@@ -108,3 +144,12 @@ def told_so_far(recording: Path, language: Language) -> Told:
     watch.look(True)
     watch.read()
     return watch.tell(language)
+
+
+def told_without_a_run(graph: Graph, language: Language) -> Told:
+    """What there is to say of what a graph keeps beyond its runs."""
+    story = load_story(graph)
+    if story is None:
+        return NOTHING
+    story.recall()
+    return story.tell(language)

@@ -169,7 +169,8 @@ class Supervisor:
     def _on_log(self, line: LogLine, _: Packet) -> None:
         self._calls.note_log(line)
         if line.stage != SUPERVISOR:
-            self._terminal.show(self._run.name_of(Process(line.stage, line.replica)), line.text, line.level)
+            who = self._run.name_of(Process(line.stage, line.replica))
+            self._terminal.show(who, line.text, line.level, progress=line.stage)
 
     def _on_finished(self, envelope: Envelope, packet: Packet) -> None:
         try:

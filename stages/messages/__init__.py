@@ -8,20 +8,24 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
+from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
 from stages.messages.robot import Brake, RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
 from stages.messages.task import (
+    Answer,
     Arrange,
     Arrangement,
-    Forget,
+    Go,
     Goal,
     Halt,
     Look,
     Move,
     Outcome,
+    Pause,
     Plan,
+    Question,
     Recover,
     Restore,
     Stop,
@@ -33,6 +37,8 @@ from stages.messages.task import (
 )
 
 __all__ = [
+    "Add",
+    "Answer",
     "Arrange",
     "Arrangement",
     "Asked",
@@ -44,23 +50,29 @@ __all__ = [
     "Depth",
     "Forget",
     "Frame",
+    "Go",
     "Goal",
     "Halt",
     "Hypothesis",
     "Intrinsics",
+    "Kept",
     "Look",
     "LookRequest",
+    "Loosen",
     "Mask",
     "Move",
     "ObjectPose",
     "Observation",
     "Outcome",
+    "Pause",
     "Plan",
     "Points",
     "Pose",
     "Poses",
     "Posterior",
+    "Question",
     "Recover",
+    "Rename",
     "Restore",
     "Rgb",
     "RobotCommand",
@@ -72,6 +84,7 @@ __all__ = [
     "SensorErrors",
     "Snapshot",
     "Stop",
+    "Strike",
     "Task",
     "Teach",
     "Transfer",

@@ -6,6 +6,7 @@ from runner.contract import Message, Struct
 from stages.messages.arrays import Box, Intrinsics, Matrix, Pose, Vector
 
 Predicate = Literal["exist", "clear", "on", "in", "has"]
+Stance = Literal["upright", "upside down", "lying"]
 
 
 class Alternative(Struct, frozen=True, kw_only=True):
@@ -91,6 +92,27 @@ class SceneObject(Struct, frozen=True, kw_only=True):
     """In the scene's :attr:`SceneGraph.frame`."""
 
 
+class Doubt(Struct, frozen=True, kw_only=True):
+    """What a look leaves open, and a person who sees the scene may know."""
+
+    kind: Literal["stance", "unknown", "which"]
+    """``stance``: how an object stands. ``unknown``: something is there that no object explains. ``which``: several
+    objects may be the one that a goal means."""
+    object: str
+    """Its name in the scene, or in the goal; empty for what is unknown."""
+    stance: Stance = "upright"
+    """How the object is taken to stand."""
+    T_base_other: Pose | None = None
+    """Where the object is if it stands otherwise."""
+    choices: tuple[str, ...] = ("yes", "no", "again")
+    """What can be answered. ``again`` is one more look; of ``which`` the others are names of the scene."""
+
+    @property
+    def key(self) -> str:
+        """Equal for doubts that one answer settles."""
+        return f"{self.kind} {self.object}".strip()
+
+
 class SceneGraph(Message, frozen=True, kw_only=True):
     """s_t: everything asserted of one scene.
 
@@ -111,6 +133,8 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     image_id: int = 0
     support: Matrix | None = None
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
+    doubts: tuple[Doubt, ...] = ()
+    """Where somebody is there to be asked."""
 
     @property
     def frame(self) -> Literal["base", "table"]:

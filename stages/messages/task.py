@@ -4,7 +4,7 @@ from typing import Literal
 
 from runner.contract import Command, Message, Struct
 from stages.messages.arrays import Pose, Poses
-from stages.messages.scene import Assertion, SceneGraph
+from stages.messages.scene import Assertion, Doubt, SceneGraph
 
 FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release", "slip", "touch", "unknown", "stop"]
 """``unknown``: let go of without having felt that it stands. ``slip``, ``touch``: why a motion was broken off."""
@@ -26,6 +26,8 @@ class Goal(Message, frozen=True, kw_only=True):
     scene: SceneGraph
     pddl: str
     """The goal as a PDDL problem fragment; pose labels are tied to poses in comments."""
+    picture: bytes = b""
+    """JPEG of the look at which it was shown, from where goals are kept; empty where nobody keeps it."""
 
 
 class Task(Message, frozen=True, kw_only=True):
@@ -129,6 +131,8 @@ class Teach(Command, frozen=True, kw_only=True):
 
     name: str
     """Letters, digits, - and _."""
+    ask: bool = False
+    """Asks where the look leaves something open."""
 
 
 class Restore(Command, frozen=True, kw_only=True):
@@ -138,13 +142,33 @@ class Restore(Command, frozen=True, kw_only=True):
 
     name: str
     """Of a goal that was taught."""
+    ask: bool = False
+    """Asks where a look leaves something open, and waits for go before anything moves."""
 
 
-class Forget(Command, frozen=True, kw_only=True):
-    """Forgets the goal of that name."""
+class Go(Command, frozen=True, kw_only=True):
+    """Carries out the plan that waits for it."""
 
-    name: str
-    """Of a goal that was taught."""
+
+class Pause(Command, frozen=True, kw_only=True):
+    """Finishes the transfer that is under way, looks and plans, and then waits for go."""
+
+
+class Question(Message, frozen=True, kw_only=True):
+    """Asks the person about what a look leaves open; nothing moves until it is answered."""
+
+    number: int
+    """Counts the questions of a task, from 1."""
+    doubt: Doubt
+
+
+class Answer(Command, frozen=True, kw_only=True):
+    """Answers the question that was asked."""
+
+    question: int
+    """Its number: what was asked before cannot be answered any more."""
+    choice: str
+    """One of those that the question offers."""
 
 
 class Look(Command, frozen=True, kw_only=True):

@@ -69,6 +69,7 @@ TOLERANCES = {
     "UnknownRegion.points": Tolerance(20.0),
     "UnknownRegion.centre_table": POSE,
     "UnknownRegion.extent_table": POSE,
+    "Doubt.T_base_other": PLANE,
     "SceneObject.T_base_object": PLANE,
     "SceneGraph.T_base_table": PLANE,
     "VirtualObject.T_parent_virtual": PLANE,

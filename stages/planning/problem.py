@@ -30,7 +30,7 @@ class Problem:
     supports: Mapping[str, str]
     """Item -> what carries it now."""
     goal: Mapping[str, str]
-    """Item of the goal -> what carries it there."""
+    """Item of the goal -> what carries it there; without those that may be anywhere."""
     clear: frozenset[str]
     """Items of the goal on and in which nothing may be."""
     concave: frozenset[str]
@@ -47,7 +47,7 @@ class Problem:
         """The problem of turning one scene into another that has at least the goal's objects."""
         return Problem(
             supports=carriers(current),
-            goal=carriers(goal),
+            goal=wanted(goal),
             clear=frozenset(item.arguments[0] for item in goal.assertions if item.predicate == "clear"),
             concave=frozenset(containers(goal) | containers(current)),
             graspable=graspable,
@@ -87,14 +87,18 @@ class Problem:
 
 def carriers(scene: SceneGraph) -> dict[str, str]:
     """Object -> what it is on or in, in the order of the scene's objects."""
-    names = {item.name for item in scene.objects}
-    found = {
+    return {item.name: TABLE for item in scene.objects} | wanted(scene)
+
+
+def wanted(goal: SceneGraph) -> dict[str, str]:
+    """The same for those of which a goal says what carries them; the others may be anywhere."""
+    names = {item.name for item in goal.objects}
+    return {
         child: support
-        for assertion in scene.assertions
+        for assertion in goal.assertions
         if assertion.predicate in ("on", "in") and assertion.arguments[0] in names
         for child, support in [assertion.arguments]
     }
-    return {item.name: found.get(item.name, TABLE) for item in scene.objects}
 
 
 def containers(scene: SceneGraph) -> set[str]:

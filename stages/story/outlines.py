@@ -7,6 +7,7 @@ import numpy as np
 
 from runner.page.story import Outline, Surety
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import inverse
 from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import UnknownRegion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
@@ -75,6 +76,12 @@ def ground(scene: SceneGraph) -> tuple[tuple[float, float], ...]:
     points = np.array([item.T_base_object[:2, 3] for item in scene.objects])
     (x0, y0), (x1, y1) = points.min(0) - MARGIN, points.max(0) + MARGIN
     return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+
+def pixel(point: Floats, T_base_camera: Floats, K: Floats) -> tuple[int, int]:
+    """Where a point of the base frame is in the image."""
+    x, y, depth = K @ (inverse(T_base_camera) @ [*point, 1.0])[:3]
+    return round(float(x / depth)), round(float(y / depth))
 
 
 def _pairs(points: Floats) -> tuple[tuple[float, float], ...]:

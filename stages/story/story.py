@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any, Literal
 
 import msgspec
@@ -12,6 +13,7 @@ import msgspec
 from runner.contract import Message, Refused
 from runner.page.story import (
     Action,
+    Arrow,
     Ask,
     Card,
     Doing,
@@ -21,21 +23,25 @@ from runner.page.story import (
     Notice,
     Photo,
     Place,
+    Question,
     Statement,
     Told,
     View,
 )
 from stages.messages import (
+    Answer,
     Arrange,
     Arrangement,
-    Forget,
     Frame,
+    Go,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Move,
     ObjectPose,
     Outcome,
+    Pause,
     Plan,
     Restore,
     SceneEstimate,
@@ -49,15 +55,19 @@ from stages.messages import (
 )
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
+from stages.messages.task import Question as AskedQuestion
 from stages.scene.catalogue import Catalogue
+from stages.scene.goals import GoalFolder
 from stages.scene.text import support
-from stages.story.outlines import footprint, ground, how_sure, outlines, region_name, surety
+from stages.story import reasons
+from stages.story.cards import GOALS, NAME, Remembered, add, card
+from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, WORLD = "demonstrator", "world"
+DEMONSTRATOR, EXECUTOR, WORLD = "demonstrator", "executor", "world"
 """Stages that take commands, as our graphs call them."""
-NAME = r"[\p{L}\p{N}_\-]+"
-"""What the name of a goal may be."""
+STEP_SECONDS = 20.0
+"""What a transfer is expected to take, before one was seen."""
 SHOWN_FAULTS = 4
 """Relations that do not hold, of a goal that was not reached."""
 Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "move"]
@@ -78,26 +88,28 @@ class Job:
     holders: frozenset[str] = frozenset()
     """Objects that things are put into rather than onto."""
     stopping: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Remembered:
-    """A goal, and the picture in which it was shown."""
-
-    goal: Goal
-    photo: Photo | None
+    question: AskedQuestion | None = None
+    """Waits for an answer."""
+    asks: bool = False
+    """The first plan is to wait for go."""
+    waits: bool = False
+    """The plan waits for go."""
+    pausing: bool = False
+    """The next plan is to wait for go."""
+    step_ns: int = 0
+    """When the newest transfer began."""
 
 
 class Story:
     """Remembers the newest picture and scene, all goals, and what is under way."""
 
     hears: tuple[type[Message], ...] = (
-        *(Teach, Restore, Forget, Look, Stop, Arrange, Arrangement, Move),
+        *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, Kept),
         *(LookRequest, Frame, SceneEstimate, SceneGraph),
-        *(Goal, Task, Plan, TransferRequest, Outcome, Verdict),
+        *(Goal, Task, Plan, TransferRequest, Outcome, Verdict, AskedQuestion, Answer, Go, Pause),
     )
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
         """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
         paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
         if not paths:
@@ -105,6 +117,9 @@ class Story:
         self._catalogue = Catalogue.load(Path(paths[0]))
         self._commanded = DEMONSTRATOR in configs and not configs[DEMONSTRATOR].get("scripted", True)
         self._simulated = WORLD in configs
+        self._brakes = "stop" in commands.get(EXECUTOR, ())
+        """Whether an arm that moves can be stopped at once."""
+        self._folder = Path(configs[GOALS]["folder"]) if GOALS in configs else None
         self._asked: dict[str, Teach | Restore | Look] = {}
         """Commands by id, until the stage takes them up."""
         self._caused_look: tuple[str, ...] = ()
@@ -118,6 +133,10 @@ class Story:
         self._scene: SceneGraph | None = None
         self._ended: tuple[Goal | Verdict, str] | None = None
         """How the last job ended, and the id of the message that said so."""
+        self._failed: list[tuple[Job, Outcome]] = []
+        """Transfers of the newest job that failed, and how far it was then."""
+        self._steps_s: list[float] = []
+        """How long transfers took so far, with the look and the plan that follow."""
         self._draws = 0
         """Disturbed scenes so far: each number draws another."""
 
@@ -145,32 +164,47 @@ class Story:
             case Arrange() | Arrangement() as arranged:
                 self._moved, self._scene = True, None
                 self._draws += arranged.kind == "start"
-            case Forget(name=name):
-                self._goals.pop(name, None)
+            case Kept(goals=goals):
+                self._keep(goals)
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
             case _:
-                self._work(heard.message)
+                self._work(heard)
 
-    def _work(self, message: Message) -> None:
+    def _work(self, heard: Heard) -> None:
         """What moves a job on."""
         if self._job is None:
             return
-        match message:
+        match heard.message:
             case Stop():
                 self._job = replace(self._job, stopping=True)
             case Task(current=scene):
                 holders = {item.name for item in scene.objects if self._catalogue[item.label].concave}
                 self._job = replace(self._job, phase="plan", holders=frozenset(holders))
             case Plan(transfers=transfers):
-                self._job = replace(self._job, transfers=(*self._job.transfers[: self._job.done], *transfers))
+                planned = (*self._job.transfers[: self._job.done], *transfers)
+                waits = bool(transfers) and (self._job.asks or self._job.pausing)
+                self._job = replace(self._job, transfers=planned, waits=waits, asks=False)
             case TransferRequest():
-                self._at("move")
-            case Outcome(number=number):
+                self._step(heard.time_ns)
+            case Outcome() as outcome:
                 self._moved, self._scene = True, None
-                self._job = replace(self._job, done=number)
+                if not outcome.success:
+                    self._failed.append((self._job, outcome))
+                self._job = replace(self._job, done=outcome.number)
             case _:
-                pass
+                self._job = _talked(self._job, heard.message)
+
+    def _step(self, time_ns: int) -> None:
+        """A transfer begins: how long steps take is learned from one to the next."""
+        assert self._job is not None
+        if self._job.step_ns:
+            self._steps_s.append((time_ns - self._job.step_ns) * 1e-9)
+        self._job = replace(self._job, phase="move", waits=False, question=None, step_ns=time_ns)
+
+    @property
+    def _step_seconds(self) -> float:
+        return median(self._steps_s) if self._steps_s else STEP_SECONDS
 
     def _begin(self, heard: Heard) -> None:
         """A look: the first of a job that somebody asked for, or one more of the same."""
@@ -190,12 +224,12 @@ class Story:
             self._asked[heard.id] = command
 
     def _start(self, command: Teach | Restore | Look, time_ns: int) -> None:
-        self._ended = None
+        self._ended, self._failed = None, []
         match command:
             case Teach(name=name):
                 self._job = Job(name, time_ns, phase="teach")
             case Restore(name=name):
-                self._job = Job(name, time_ns, phase="restore")
+                self._job = Job(name, time_ns, phase="restore", asks=command.ask)
             case Look():
                 self._job = Job("", time_ns)
 
@@ -213,6 +247,14 @@ class Story:
             self._goals[end.name] = Remembered(end, self._photo)
         self._ended, self._job = (end, id), None
 
+    def recall(self) -> None:
+        """Takes the goals that are on disk."""
+        if self._folder is not None:
+            self._keep(tuple(GoalFolder(self._folder).read()[0].values()))
+
+    def _keep(self, goals: tuple[Goal, ...]) -> None:
+        self._goals = {goal.name: Remembered.of(goal) for goal in goals}
+
     # ------------------------------------------------------------------------------------------ what is told
 
     def tell(self, language: Language) -> Told:
@@ -220,6 +262,7 @@ class Story:
         words = words_of(language)
         return Told(
             doing=self._doing(words),
+            question=self._question(words),
             notice=self._notice(words),
             view=self._view(words),
             statements=tuple(self._statements(words)),
@@ -227,8 +270,16 @@ class Story:
             map=self._map(words),
             cards_title=words.say("goals"),
             cards_hint=words.say("no_goals"),
-            cards=tuple(self._card(name, kept, words) for name, kept in self._goals.items()),
+            cards=tuple(self._cards(words)),
+            cards_actions=(add(words),) if self._folder else (),
         )
+
+    def _cards(self, words: Words) -> Iterator[Card]:
+        for name, kept in self._goals.items():
+            asked = {"name": name, "ask": "true"}
+            label, now = words.say("do_restore"), self._job is None
+            restore = Action(DEMONSTRATOR, "restore", label, asked, kind="first", now=now)
+            yield card(kept, (restore,) if self._commanded else (), words)
 
     def _doing(self, words: Words) -> Doing:
         job = self._job
@@ -236,18 +287,65 @@ class Story:
             return Doing(words.say("idle" if self._commanded else "script"))
         steps = tuple(_move(transfer, job, words) for transfer in job.transfers)
         step = min(job.done + 1, len(steps))
+        expected = 0.0
+        if job.step_ns and not job.waits:
+            left = (len(steps) - job.done) * self._step_seconds
+            expected = (job.step_ns - job.began_ns) * 1e-9 + left
+        return Doing(self._what(job, steps, step, words), True, steps, step, job.began_ns, expected)
+
+    def _what(self, job: Job, steps: tuple[str, ...], step: int, words: Words) -> str:
+        """What the robot does, or waits for."""
         if job.stopping:
-            text = words.say("stopping")
-        else:
-            text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
-        return Doing(text, True, steps, step, job.began_ns)
+            return words.say("stopping")
+        if job.question is not None:
+            return words.say("asks")
+        if job.waits:
+            minutes = (len(steps) - job.done) * self._step_seconds / 60
+            return words.say("waits", count=len(steps) - job.done, minutes=max(1, round(minutes)))
+        text = steps[step - 1] if job.phase == "move" else words.say(job.phase, name=job.name)
+        return words.say("pausing", text=text) if job.pausing else text
+
+    def _question(self, words: Words) -> Question | None:
+        """What the person is asked."""
+        asked = self._job.question if self._job else None
+        if asked is None:
+            return None
+        doubt = asked.doubt
+        noun = words.noun(doubt.object)
+        key = f"ask_{doubt.stance.replace(' ', '_')}" if doubt.kind == "stance" else f"ask_{doubt.kind}"
+        answers = tuple(
+            Action(
+                DEMONSTRATOR,
+                "answer",
+                words.bare(choice) if choice in names else words.say(f"answer_{choice}"),
+                {"question": str(asked.number), "choice": choice},
+                kind="first" if choice == doubt.choices[0] and doubt.kind != "which" else "plain",
+            )
+            for names in [_names(self._scene)]
+            for choice in doubt.choices
+        )
+        about = region_name(0) if doubt.kind == "unknown" else doubt.object
+        return Question(words.say(key, object=noun), answers, about)
 
     def _view(self, words: Words) -> View | None:
         if self._photo is None:
             return None
         height, width = self._photo.rgb.shape[:2]
         found = outlines(self._estimate, self._catalogue, (height, width), words) if self._estimate else ()
-        return View(self._photo, words.say("outdated" if self._moved else "seen"), found)
+        arrows = tuple(self._arrows(words))
+        return View(self._photo, words.say("outdated" if self._moved else "seen"), found, arrows)
+
+    def _arrows(self, words: Words) -> Iterator[Arrow]:
+        """What will be moved, from where it will be then."""
+        job, scene = self._job, self._scene
+        if job is None or scene is None or scene.T_base_camera is None:
+            return
+        places = {item.name: item.T_base_object for item in scene.objects}
+        for transfer in job.transfers[job.done :]:
+            start, end = places[transfer.object], transfer.T_base_targets[0]
+            pixels = (pixel(T[:3, 3], scene.T_base_camera, scene.K) for T in (start, end))
+            yield Arrow(_move(transfer, job, words), *pixels)
+            places[transfer.object] = end
 
     def _statements(self, words: Words) -> Iterator[Statement]:
         if self._moved and self._job is None:
@@ -275,13 +373,21 @@ class Story:
         idle = self._job is None
         stoppable = self._job is not None and not self._job.stopping
         ask = Ask("name", words.say("name"), words.say("name_hint"), NAME)
-        yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {}, ask, kind="first", now=idle)
+        if self._job is not None and self._job.waits:
+            yield Action(DEMONSTRATOR, "go", words.say("do_go"), {}, kind="first")
+        if self._job is not None and self._job.transfers and not (self._job.waits or self._job.pausing):
+            yield Action(DEMONSTRATOR, "pause", words.say("do_pause"), {}, now=stoppable)
+        if self._job is not None and self._job.pausing and not self._job.waits:
+            yield Action(DEMONSTRATOR, "go", words.say("do_no_pause"), {})
+        yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {"ask": "true"}, ask, kind="first", now=idle)
         yield Action(DEMONSTRATOR, "look", words.say("do_look"), {}, now=idle)
         if self._simulated:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
+        moves = self._brakes and self._job is not None and self._job.phase == "move"
+        who = EXECUTOR if moves else DEMONSTRATOR
+        yield Action(who, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
 
     def _map(self, words: Words) -> Map | None:
         """The scene from above, where people may move what carries nothing."""
@@ -304,16 +410,6 @@ class Story:
         )
         return Map(words.say("map"), words.say("map_hint"), ground(scene), places, WORLD, "move")
 
-    def _card(self, name: str, kept: Remembered, words: Words) -> Card:
-        names = [item.name for item in kept.goal.scene.objects]
-        text = words.say("goal", count=len(names), objects=words.nouns(names))
-        restore = Action(
-            DEMONSTRATOR, "restore", words.say("do_restore"), {"name": name}, kind="first", now=self._job is None
-        )
-        sure = words.say("forget_sure", name=name)
-        forget = Action(DEMONSTRATOR, "forget", words.say("do_forget"), {"name": name}, confirm=sure)
-        return Card(name, name, text, kept.photo, (restore, forget) if self._commanded else ())
-
     # ------------------------------------------------------------------------------------------ how it ended
 
     def _notice(self, words: Words) -> Notice | None:
@@ -326,10 +422,20 @@ class Story:
         if end.success:
             return Notice(True, words.say("restored", name=end.goal_name), message=id)
         if end.failed_stage == STOPPED:
-            return Notice(True, words.say("stopped"), message=id)
+            return Notice(True, f"{words.capital(reasons.told(end.reason, words))}.", message=id)
         key = "failed" if end.goal_name in self._goals else "not_remembered"
-        help = (*self._faults(end, words), words.say(f"help_{end.failed_stage}"))
-        return Notice(False, words.say(key, name=end.goal_name, reason=end.reason), help, id)
+        help = (words.say(f"at_{end.failed_stage}"), *self._faults(end, words), words.say(f"help_{end.failed_stage}"))
+        text = words.say(key, name=end.goal_name, reason=reasons.told(end.reason, words))
+        return Notice(False, text, help, id, tuple(self._attempts(words)))
+
+    def _attempts(self, words: Words) -> Iterator[str]:
+        """What was tried in vain."""
+        if self._failed:
+            yield words.say("tried")
+        for job, failed in self._failed:
+            step = _move(job.transfers[failed.number - 1], job, words)
+            reason = reasons.told(f"{failed.failed_stage}: {failed.reason}", words)
+            yield words.say("tried_step", step=step, reason=reason)
 
     def _faults(self, verdict: Verdict, words: Words) -> list[str]:
         """What is not where it belongs, as sentences."""
@@ -347,8 +453,29 @@ class Story:
         return found[:SHOWN_FAULTS]
 
 
+def _names(scene: SceneGraph | None) -> set[str]:
+    return {item.name for item in scene.objects} if scene else set()
+
+
 def _statement(text: str, name: str, item: ObjectPose | None, words: Words) -> Statement:
     return Statement(text, name) if item is None else Statement(text, name, surety(item), how_sure(item, words))
+
+
+def _talked(job: Job, message: Message) -> Job:
+    """A job after what the robot and the person have said to each other."""
+    match message:
+        case AskedQuestion() as question:
+            return replace(job, question=question)
+        case Answer(question=number, choice=choice):
+            asked = job.question
+            taken = asked is not None and asked.number == number and choice in asked.doubt.choices
+            return replace(job, question=None) if taken else job
+        case Pause():
+            return replace(job, pausing=True)
+        case Go():
+            return replace(job, pausing=False, waits=False, asks=False)
+        case _:
+            return job
 
 
 def _move(transfer: Transfer, job: Job, words: Words) -> str:

@@ -50,8 +50,16 @@ class Words:
 
     def say(self, key: str, **parts: object) -> str:
         """The text of a key with its parts, beginning with a capital."""
-        text = self._texts[key].format(**parts)
+        return self.capital(self.part(key, **parts))
+
+    @staticmethod
+    def capital(text: str) -> str:
+        """The beginning of a sentence."""
         return text[:1].upper() + text[1:]
+
+    def part(self, key: str, **parts: object) -> str:
+        """The same within a sentence."""
+        return self._texts[key].format(**parts)
 
     def noun(self, name: str) -> Noun:
         """An object by its name in a scene: that of its label, with a number where there are several."""

@@ -1,5 +1,6 @@
 import io
 import os
+import re
 
 import pytest
 
@@ -48,3 +49,38 @@ def test_nothing_is_lost_with_a_reader_that_is_gone():
     with os.fdopen(writing, "w") as stream:
         terminal = Terminal(stream)
         terminal.plain("one", "two")
+
+
+def on_screen(written: str) -> list[str]:
+    """What is to be seen once all is written."""
+    lines: list[str] = []
+    for up, text in re.findall(r"(?:\033\[(\d+)A\033\[J)?([^\033]*)", written):
+        lines = lines[: len(lines) - int(up or 0)] + text.splitlines()
+    return lines
+
+
+def tell(terminal: Terminal) -> None:
+    for number in range(3):
+        terminal.show("camera", f"frame {number}", seconds=number, progress="camera")
+        terminal.show(f"filter.{number % 2}", f"scene {number} {'x' * 200}", seconds=number, progress="filter")
+    terminal.show("camera", "lost", "warning", seconds=3, progress="camera")
+    terminal.show("report", "the story\nof it", seconds=4, progress="report")
+    terminal.plain("the end")
+
+
+def test_who_looks_sees_one_line_of_progress_for_each_stage(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "60")
+    stream = Screen()
+    tell(Terminal(stream))
+    *stays, camera, filter, end = on_screen(stream.getvalue())
+    assert stays == ["    3.0 s  camera           lost", "    4.0 s  report           the story", "of it"]
+    assert end == "the end"
+    assert camera == "    2.0 s  camera           frame 2"
+    assert filter == f"    2.0 s  filter.0         scene 2 {'x' * 60}"[:59]
+
+
+@pytest.mark.parametrize(("stream", "verbose"), [(io.StringIO(), False), (Screen(), True)])
+def test_a_file_and_who_wants_all_of_it_get_every_line(stream: io.StringIO, verbose: bool):
+    tell(Terminal(stream, verbose=verbose))
+    assert "\033[J" not in stream.getvalue() and stream.getvalue().count("\n") == 10

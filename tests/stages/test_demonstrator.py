@@ -6,18 +6,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.contract import Message, Refused
-from stages.demonstrator import Demonstrator, change_of_plan
+from runner.contract import Command, Message, Refused
+from stages.demonstrator import Demonstrator, KeepingDemonstrator, change_of_plan
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import (
+    Answer,
     Arrangement,
-    Forget,
+    Go,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Observation,
+    Pause,
+    Question,
     Recover,
     Restore,
     RobotState,
@@ -29,6 +33,7 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
+from stages.messages.scene import Doubt
 from stages.messages.task import STOPPED
 from stages.scene.virtual import without
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
@@ -89,7 +94,7 @@ class Episode:
         ending = msgspec.structs.replace(outcome(number, item, **fields), T_base_object=at)
         return self.take(self.stage.on_outcome(ending, self.ctx))
 
-    def called(self, command: Teach | Restore | Forget | Look | Stop) -> list[Message]:
+    def called(self, command: Command) -> list[Message]:
         handler = getattr(self.stage, f"on_{type(command).__name__.lower()}")
         return self.take(handler(command, self.ctx))
 
@@ -421,16 +426,147 @@ def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -
         assert episode.seen(GOAL) == []
 
 
-def test_a_goal_that_is_forgotten_cannot_be_restored() -> None:
+def test_what_is_kept_on_disk_can_be_restored_and_what_was_deleted_cannot() -> None:
     episode = Episode(scripted=False)
-    for name in ("tea", "mess"):
-        episode.called(Teach(name=name))
-        episode.seen(GOAL)
-    assert episode.called(Forget(name="tea")) == []
-    for command in (Restore(name="tea"), Forget(name="tea")):
-        with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
-            episode.called(command)
+    keeping = KeepingDemonstrator(Demonstrator.Config(catalogue=CATALOGUE, scripted=False))
+    episode.stage = keeping
+    keeping.on_kept(Kept(goals=(Goal(name="tea", scene=GOAL, pddl=""), Goal(name="mess", scene=START, pddl=""))))
+    assert episode.called(Restore(name="tea")) == [LookRequest(purpose="restore tea")]
+    keeping.on_kept(Kept(goals=(Goal(name="mess", scene=START, pddl=""),)))
+    (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.goal is GOAL
+    episode.called(Stop())
+    episode.planned(STEP)
+    with pytest.raises(Refused, match="name='tea': no such goal; valid: mess"):
+        episode.called(Restore(name="tea"))
     assert episode.called(Restore(name="mess")) == [LookRequest(purpose="restore mess")]
+
+
+# ------------------------------------------------------------------------------------------ somebody stands beside it
+
+T_TURNED = np.diag([1.0, -1, -1, 1]) @ np.eye(4)
+STANDS = Doubt(kind="stance", object="cup", stance="upside down", T_base_other=T_TURNED)
+UNKNOWN = Doubt(kind="unknown", object="", choices=("leave", "again"))
+
+
+def doubtful(graph: SceneGraph, *doubts: Doubt) -> SceneGraph:
+    return msgspec.structs.replace(graph, doubts=doubts)
+
+
+def test_a_plan_waits_for_go_where_somebody_wants_to_see_it() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    with pytest.raises(Refused, match="nothing waits for go"):
+        episode.called(Go())
+    episode.called(Restore(name="tea", ask=True))
+    episode.seen(START)
+    assert episode.planned(STEP) == []
+    (request,) = episode.called(Go())
+    assert isinstance(request, TransferRequest) and request.transfer == STEP
+    episode.ended(1, STEP)
+    episode.seen(START)
+    (request,) = episode.planned(STEP)  # it was shown once
+    assert isinstance(request, TransferRequest)
+
+
+def test_after_a_pause_it_looks_before_it_goes_on() -> None:
+    episode = Episode(scripted=False)
+    with pytest.raises(Refused, match="nothing is under way"):
+        episode.called(Pause())
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    episode.called(Restore(name="tea"))
+    episode.seen(START)
+    episode.planned(STEP)
+    episode.called(Pause())
+    episode.ended(1, STEP)
+    episode.seen(START)
+    assert episode.planned(STEP) == []
+    assert episode.called(Go()) == [LookRequest(purpose="after transfer 1")]
+    episode.seen(START)
+    assert isinstance(episode.planned(STEP)[0], TransferRequest)
+    episode.called(Pause())
+    assert episode.called(Go()) == []  # before it came to it
+
+
+def test_what_waits_can_be_stopped_at_once() -> None:
+    for graph in (doubtful(START, UNKNOWN), START):
+        episode = Episode(scripted=False)
+        episode.called(Teach(name="tea"))
+        episode.seen(GOAL)
+        episode.called(Restore(name="tea", ask=True))
+        episode.seen(graph)
+        if not graph.doubts:
+            episode.planned(STEP)
+        assert the_verdict(episode.called(Stop())).failed_stage == STOPPED
+        assert episode.called(Look()) == [LookRequest(purpose="look")]
+
+
+def test_a_doubt_is_asked_about_and_the_answer_is_used() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea", ask=True))
+    (question,) = episode.seen(doubtful(GOAL, STANDS, UNKNOWN))
+    assert question == Question(number=1, doubt=STANDS)
+    assert episode.ctx.lines[-1].endswith("runner call demonstrator answer question=1 choice=yes|no|again")
+    for wrong, reason in (
+        (Answer(question=2, choice="yes"), "question=2: 1 is asked now"),
+        (Answer(question=1, choice="perhaps"), "choice='perhaps': valid: yes, no, again"),
+    ):
+        with pytest.raises(Refused, match=reason):
+            episode.called(wrong)
+    assert episode.called(Answer(question=1, choice="no")) == [Question(number=2, doubt=UNKNOWN)]
+    (goal,) = episode.called(Answer(question=2, choice="leave"))
+    assert isinstance(goal, Goal)
+    cup = next(item for item in goal.scene.objects if item.name == "cup")
+    assert cup.T_base_object is T_TURNED
+    with pytest.raises(Refused, match="question=2: nothing is asked now"):
+        episode.called(Answer(question=2, choice="leave"))
+    episode.called(Teach(name="more", ask=True))
+    assert episode.seen(doubtful(GOAL, STANDS)) == [Question(number=3, doubt=STANDS)]
+    assert episode.called(Answer(question=3, choice="again")) == [LookRequest(purpose="goal more")]
+    assert episode.seen(doubtful(GOAL, STANDS)) == [Question(number=4, doubt=STANDS)]
+    (goal,) = episode.called(Answer(question=4, choice="yes"))
+    assert isinstance(goal, Goal) and goal.scene.objects == GOAL.objects
+
+
+def test_a_doubt_is_settled_for_the_whole_task_and_asked_about_only_where_somebody_is_there() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    (goal,) = episode.seen(doubtful(GOAL, STANDS, UNKNOWN))
+    assert isinstance(goal, Goal)
+    episode.called(Restore(name="tea", ask=True))
+    episode.seen(doubtful(START, UNKNOWN))
+    (task,) = episode.called(Answer(question=1, choice="leave"))
+    assert isinstance(task, Task)
+    episode.planned(STEP)
+    episode.called(Go())
+    episode.ended(1, STEP)
+    assert isinstance(episode.seen(doubtful(START, UNKNOWN))[0], Task)
+
+
+def test_of_two_cups_the_person_says_which_is_meant() -> None:
+    two = Layout().put("milk_carton", 0.0, 0.0).put("cup", 0.1, 0.2)
+    extra = Layout({**two.poses, "cup_2": upright("cup", -0.1, -0.2, 0.0)})
+    graph = extra.graph()
+    labelled = tuple(
+        msgspec.structs.replace(item, label="cup") if item.name == "cup_2" else item for item in graph.objects
+    )
+    graph = msgspec.structs.replace(graph, objects=labelled)
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(two.graph())
+    episode.called(Restore(name="tea", ask=True))
+    (question,) = episode.seen(graph)
+    assert isinstance(question, Question)
+    assert (question.doubt.key, question.doubt.choices) == ("which cup", ("cup", "cup_2", "again"))
+    (task,) = episode.called(Answer(question=1, choice="cup_2"))
+    assert isinstance(task, (Task, Verdict))
+    scene = task.current if isinstance(task, Task) else episode.stage._state.scene  # pyright: ignore[reportPrivateUsage]
+    assert scene is not None
+    places = {item.name: item.T_base_object for item in scene.objects}
+    seen = {item.name: item.T_base_object for item in graph.objects}
+    assert places["cup"] is seen["cup_2"] and places["cup_2"] is seen["cup"]
 
 
 def test_commands_at_the_wrong_time_are_refused() -> None:

@@ -114,7 +114,7 @@ def test_a_demonstrator_that_is_asked_always_answers() -> None:
 def test_a_graph_takes_the_demonstrator_that_is_asked(tmp_path: Path) -> None:
     """As docs/ros2.md says: the graph of the robot at somebody's command, with two lines changed and one stage more."""
     text = (ROOT / "graphs" / "interactive.yaml").read_text()
-    text = text.replace("stages.demonstrator:Demonstrator", "stages.demonstrator:AskedDemonstrator")
+    text = text.replace("stages.demonstrator:KeepingDemonstrator", "stages.demonstrator:AskedDemonstrator")
     port = "      robot_state: world.robot_state\n      scene_graph"
     text = text.replace(port, f"      asked: ros2.asked\n{port}")
     text += """

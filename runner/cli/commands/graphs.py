@@ -27,7 +27,9 @@ def add_commands(commands: Commands) -> None:
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
     add_recordings(up, "where recordings go")
     up.add_argument(
-        "--verbose", action="store_true", help="say when each process is ready, and what stages say for debugging"
+        "--verbose",
+        action="store_true",
+        help="keep every line, say when each process is ready, and what stages say for debugging",
     )
     seen = up.add_mutually_exclusive_group()
     seen.add_argument("--view", action="store_true", help="open the viewer")
@@ -83,7 +85,7 @@ def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
         forks=forks,
         steps_only=options.steps_only,
     )
-    with page_beside(supervisor.id) if options.page or graph.page else contextlib.nullcontext():
+    with page_beside(supervisor.id, terminal.plain) if options.page or graph.page else contextlib.nullcontext():
         return supervisor.run(view=options.view)
 
 

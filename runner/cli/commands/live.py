@@ -16,6 +16,7 @@ from runner.contract import Refused
 
 if TYPE_CHECKING:
     from runner.live.live import Live
+    from runner.page.story import Action
 
 
 def add_commands(commands: Commands) -> None:
@@ -46,6 +47,8 @@ def add_commands(commands: Commands) -> None:
 
     goals = add(commands, "goals", _goals, "show what the running graph was taught, and what can be done with it")
     goals.add_argument("name", metavar="NAME", nargs="?", help="only this one")
+    text = "what this graph keeps on disk, whether it runs or not"
+    goals.add_argument("--graph", metavar="GRAPH", type=Path, help=text)
     _add_run(goals)
 
     page = add(commands, "page", _page, "serve a page on the running graph, for people who do not program")
@@ -160,21 +163,30 @@ def _restart(options: argparse.Namespace) -> None:
 
 def _goals(options: argparse.Namespace) -> None:
     from runner.graph.document import suggest
-    from runner.page.watch import told_so_far
+    from runner.graph.graph import load_graph
+    from runner.page.watch import told_so_far, told_without_a_run
     from runner.supervise.registry import find_run
 
-    told = told_so_far(Path(find_run(options.run).recording), "en")
+    if options.graph is not None:
+        told = told_without_a_run(load_graph(options.graph), "en")
+    else:
+        told = told_so_far(Path(find_run(options.run).recording), "en")
     titles = [card.title for card in told.cards]
     if options.name is not None and options.name not in titles:
         raise Refused(f"{options.name}: is not remembered{suggest(options.name, titles)}")
     for card in told.cards:
         if options.name in (None, card.title):
-            print(card.title, f"    {card.text}", sep="\n")
-            for one in card.actions:
-                typed = (f"{name}={shlex.quote(value)}" for name, value in one.arguments.items())
-                print("   ", "runner call", one.stage, one.command, *typed)
+            calls = (_typed(one) for one in (*card.actions, *card.more))
+            print(card.title, *(f"    {line}" for line in (card.text, *calls)), sep="\n")
     if not told.cards:
         print(told.cards_hint or "this graph remembers nothing")
+
+
+def _typed(action: Action) -> str:
+    """What to type instead of pressing a button."""
+    asked = [] if action.ask is None else [f"{action.ask.field}=..."]
+    fields = [f"{name}={shlex.quote(value)}" for name, value in action.arguments.items()] + asked
+    return " ".join(["runner call", action.stage, action.command, *fields])
 
 
 def _page(options: argparse.Namespace) -> None:

@@ -1,11 +1,17 @@
-// The recordings beside the running one.
+// The recordings beside the running one, and one of them told again.
 
 import {html, nothing} from "./lit-html.js";
 import {lasted, size} from "./parts.js";
+import {notice, question, statements, view} from "./scene.js";
 
 const WORDS = {COMPLETE: "complete", INCOMPLETE: "incomplete"};
+const LONGEST_MS = 2000; // that a moment is shown while it plays
 
 export function history(page) {
+  return page.past ? replayed(page, page.past) : list(page);
+}
+
+function list(page) {
   const runs = page.runs ?? [];
   const when = new Intl.DateTimeFormat(page.language, {dateStyle: "medium", timeStyle: "short"});
   return html`<section aria-labelledby="runs"><h2 id="runs">${page.say("runs")}</h2>
@@ -16,7 +22,84 @@ export function history(page) {
       <span>${run.running ? page.say("running") : lasted(run.seconds)}</span>
       <span class="sure ${run.verdict === "COMPLETE" ? "sure" : run.running ? "unsure" : "doubtful"}">
         ${run.running ? page.say("being_written") : page.say(WORDS[run.verdict] ?? "torn")}</span>
-      ${run.running ? nothing : html`<a href="runs/${run.name}.mcap" download
-        >${page.say("download", {size: size(run.bytes)})}<span class="unseen"> ${run.name}</span></a>`}
+      <span><a href="#history/${run.name}">${page.say("replay")}<span class="unseen"> ${run.name}</span></a>
+      ${run.running ? nothing : html` · <a href="runs/${run.name}.mcap" download
+        >${page.say("download", {size: size(run.bytes)})}<span class="unseen"> ${run.name}</span></a>`}</span>
     </li>`)}</ul></section>`;
+}
+
+// ------------------------------------------------------------------------------------------ one of them again
+
+/** Asks for a recording's moments, and shows the one that a message brought about, or the first. */
+export async function replay(page, name, message) {
+  if (page.past?.name !== name || page.past.language !== page.language) {
+    page.past = {name, language: page.language, moments: null, at: page.past?.at ?? 0, refused: ""};
+    page.draw();
+    const answer = await fetch(`runs/${name}/${page.language}.json`);
+    if (page.past?.name !== name) return;
+    page.past[answer.ok ? "moments" : "refused"] = await (answer.ok ? answer.json() : answer.text());
+  }
+  const found = page.past.moments?.findIndex((moment) => moment.message === message) ?? -1;
+  if (found >= 0) page.past.at = found;
+  page.past.at = Math.min(page.past.at, Math.max(0, (page.past.moments?.length ?? 1) - 1));
+  page.draw();
+}
+
+function replayed(page, past) {
+  const back = html`<p><a href="#history">${page.say("back")}</a></p>`;
+  if (past.refused) return html`${back}<p class="refused" role="alert">${past.refused}</p>`;
+  if (!past.moments) return html`${back}<p class="quiet" role="status">${page.say("reading")}</p>`;
+  const moment = past.moments[past.at];
+  if (!moment) return html`${back}<p class="quiet">${page.say("nothing_told")}</p>`;
+  const to = (at) => { past.at = at; page.draw(); };
+  const shown = {...page, told: moment, photos: `runs/${past.name}`};
+  return html`${back}<div class="scene">
+    <div class="seen">${view(shown, moment.view)}
+      <section class="player" aria-label=${page.say("replay")}>
+        <button @click=${() => play(page, past)}>${page.say(past.playing ? "hold" : "play")}</button>
+        <button ?disabled=${!past.at} @click=${() => to(past.at - 1)}>${page.say("before")}</button>
+        <button ?disabled=${past.at + 1 >= past.moments.length} @click=${() => to(past.at + 1)}>${page.say("after")}</button>
+        <input type="range" aria-label=${page.say("moment")} aria-valuetext="${lasted(moment.seconds)}: ${moment.doing.text}"
+          min="0" max=${past.moments.length - 1} .value=${String(past.at)} @input=${(event) => to(Number(event.target.value))}>
+        <span class="quiet">${lasted(moment.seconds)} / ${lasted(past.moments.at(-1).seconds)}</span>
+      </section></div>
+    <div class="said"><section class="doing" aria-labelledby="then"><h2 id="then">${page.say("then")}</h2>
+      <p class="what">${moment.doing.text}</p>
+      ${moment.doing.steps.length ? html`<ol class="steps">${moment.doing.steps.map((one, k) => html`<li
+        class=${k + 1 < moment.doing.step ? "past" : ""} aria-current=${k + 1 === moment.doing.step ? "step" : nothing}
+        >${one}</li>`)}</ol>` : nothing}
+      ${question(page, moment.question && {...moment.question, answers: []})}
+      ${notice(page, moment.notice, "")}
+      <p class="quiet">${page.say("ask_engineer")} <code>runner why ${moment.message} ${past.name}.mcap</code></p>
+    </section></div>
+    ${statements(page, moment)}
+    ${solid(page, past)}
+  </div>`;
+}
+
+/** The robot and what it sees in 3D, in Rerun's viewer: large, so only once it is wanted. */
+function solid(page, past) {
+  const wanted = () => { past.solid = !past.solid; page.draw(); };
+  const drawing = new URL(`runs/${past.name}.rrd`, location.href).href.split("#")[0];
+  return html`<section class="solid" aria-label=${page.say("solid")}>
+    <button aria-expanded=${past.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
+    ${past.solid ? html`<iframe title=${page.say("solid")}
+      src="viewer/index.html?hide_welcome_screen&persist=0&url=${encodeURIComponent(drawing)}"></iframe>` : nothing}
+  </section>`;
+}
+
+/** Goes through the moments as they came, but waits for none of them long. */
+function play(page, past) {
+  past.playing = !past.playing;
+  const step = () => {
+    if (!past.playing || page.past !== past) return;
+    const [now, next] = [past.moments[past.at], past.moments[past.at + 1]];
+    past.playing = Boolean(next);
+    if (next) setTimeout(() => { if (past.playing) { past.at += 1; page.draw(); step(); } },
+      Math.min(LONGEST_MS, 1000 * (next.seconds - now.seconds)));
+    page.draw();
+  };
+  if (past.at + 1 >= past.moments.length) past.at = 0;
+  page.draw();
+  step();
 }

@@ -2,7 +2,7 @@
 
 import {html, nothing, render} from "./lit-html.js";
 import {engineer} from "./engineer.js";
-import {history} from "./history.js";
+import {history, replay} from "./history.js";
 import {button} from "./parts.js";
 import {scene} from "./scene.js";
 
@@ -25,6 +25,7 @@ const page = {
   status: null,
   log: [],
   runs: null, // recordings; null until they were asked for
+  past: null, // the recording that is told again: its name, its moments, the one that is shown
   marked: "", // the outline that is pointed at
   refused: {}, // why a command could not be called, by stage.command
 
@@ -72,7 +73,7 @@ function whole() {
       ${banner()}
       ${VIEWS[page.view](page)}
     </main>
-    <footer><span>${page.run?.name ?? ""}</span></footer>`;
+    <footer>${page.run ? html`<a href="#history/${page.run.name}">${page.run.name}</a>` : nothing}</footer>`;
 }
 
 function tab(name) {
@@ -141,14 +142,18 @@ async function choose(language) {
   document.title = page.say("title");
   tell();
   page.draw();
+  if (page.past) await replay(page, page.past.name);
 }
 
 async function turn() {
-  const wanted = location.hash.slice(1);
+  const [wanted, name, message] = decodeURIComponent(location.hash.slice(1)).split("/");
   page.view = wanted in VIEWS ? wanted : "scene";
+  if (!name) page.past = null;
   tell();
   page.draw();
-  if (page.view === "history") {
+  if (name) {
+    await replay(page, name, message);
+  } else if (page.view === "history") {
     page.runs = await (await fetch("runs")).json();
     page.draw();
   }

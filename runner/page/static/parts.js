@@ -3,30 +3,37 @@
 import {html, nothing} from "./lit-html.js";
 
 /** A button for an action; where it asks for something, a small form. Beside it stands why it was refused. */
-export function button(page, action, {shortcut} = {}) {
+export function button(page, action, {shortcut, about} = {}) {
   const reason = page.refused[`${action.stage}.${action.command}`];
   const kind = action.kind === "plain" ? "" : action.kind;
-  const send = (event) => {
+  const send = async (event) => {
     event.preventDefault();
     if (action.confirm && !confirm(action.confirm)) return;
-    const args = {...action.arguments};
-    if (action.ask) args[action.ask.field] = new FormData(event.target).get("asked");
+    const form = event.target, args = {...action.arguments};
+    if (action.ask) args[action.ask.field] = await filled(new FormData(form).get("asked"));
     page.call(action.stage, action.command, args);
-    if (action.ask) event.target.reset();
+    form.reset();
   };
   return html`<form class="action ${kind}" @submit=${send}>
     ${action.ask ? field(action) : nothing}
     <button class=${kind} ?disabled=${!action.now || !page.connected}
-      aria-keyshortcuts=${shortcut ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
+      aria-keyshortcuts=${shortcut ?? nothing} aria-describedby=${about ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
       >${action.label}</button>
     ${reason ? html`<p class="refused" role="alert">${page.say("refused")} ${reason}</p>` : nothing}
   </form>`;
 }
 
+/** What was typed, or the content of a file as base64. */
+async function filled(value) {
+  if (!(value instanceof File)) return value;
+  const bytes = new Uint8Array(await value.arrayBuffer());
+  return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+}
+
 function field({ask, command}) {
   const hint = `${command}-hint`;
   return html`<label>${ask.label}
-      <input name="asked" required autocomplete="off" maxlength="60" pattern=${ask.pattern || nothing}
+      <input name="asked" type=${ask.kind} required autocomplete="off" maxlength="60" pattern=${ask.pattern || nothing}
         title=${ask.hint || nothing} aria-describedby=${ask.hint ? hint : nothing}></label>
     ${ask.hint ? html`<p class="hint" id=${hint}>${ask.hint}</p>` : nothing}`;
 }

@@ -53,7 +53,7 @@ class Memory:
                 taken |= false
         if not kept:
             return scene
-        return self._related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
+        return self.related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
 
     def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
         view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
@@ -75,7 +75,7 @@ class Memory:
         level = a.z_bottom < b.z_top and b.z_bottom < a.z_top
         return level and regions.separation(a.outline, b.outline) < 0
 
-    def _related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
+    def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
         """The same scene with other objects: what carries what is found anew, regions stay where both objects do."""
         names = {item.name for item in objects}
         near = tuple(item for item in scene.virtual_objects if {item.parent, item.child} <= names)

@@ -31,7 +31,7 @@ def browser() -> Generator[Browser]:
 
 @contextmanager
 def opened(
-    browser: Browser, url: str, *, width: int = 1280, language: str = "en-GB", patience_ms: float = 20_000
+    browser: Browser, url: str, *, width: int = 1280, language: str = "en-GB", patience_ms: float = 60_000
 ) -> Generator[Page]:
     """A page of its own; fails where a script of it does. What is expected may take ``patience_ms``."""
     context = browser.new_context(viewport={"width": width, "height": 800}, locale=language)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -16,7 +17,9 @@ from playwright.sync_api import Browser, Page, expect
 from websockets.sync.client import connect
 
 from runner.contract import Refused
+from runner.live.live import Live
 from runner.page.guard import new_token
+from runner.supervise.registry import find_run
 from runner.testing import finish, read_until, runner, start_graph
 from tests.runner.common.waiting import wait_until
 from tests.runner.page.browser import browser, faults, opened
@@ -67,7 +70,7 @@ def page(lamp: Lamp, chromium: Browser) -> Iterator[Page]:
 
 def asked(url: str, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, str]:
     """Status and text of an answer; ``path`` is below the server, not below the token."""
-    with closing(http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)) as connection:
+    with closing(http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)) as connection:
         connection.request(method, path, body or None, headers)
         answer = connection.getresponse()
         return answer.status, answer.read().decode(errors="replace")
@@ -162,6 +165,36 @@ def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None
     expect(refusal).to_have_text("That does not work: times=10: makes people dizzy; valid: 1 to 9")
 
 
+def test_a_question_is_asked_and_marked_and_answered(page: Page) -> None:
+    asked_now = page.get_by_role("alert").filter(has_text="Is it bright?")
+    expect(asked_now).to_be_visible()
+    expect(page.locator(".picture .name.marked")).to_have_text("? unsure lamp")
+    expect(page.locator(".picture .step text")).to_have_text("1")
+    asked_now.get_by_role("button", name="Very").press("Enter")
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    expect(page.get_by_role("log")).to_contain_text("is dark very bright")
+
+
+def test_what_is_kept_is_edited_downloaded_and_brought(page: Page, lamp: Lamp) -> None:
+    page.get_by_text("Its parts").press("Enter")
+    take_off = page.get_by_role("button", name="Take off")
+    expect(take_off).to_have_accessible_description("It has a shade.")
+    take_off.press("Enter")
+    page.get_by_text("More", exact=False).first.press("Enter")
+    page.get_by_label("What to write on it").fill("mine")
+    page.keyboard.press("Enter")
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Export").press("Enter")
+    assert (download.value.suggested_filename, download.value.path().read_bytes()) == ("lamp.txt", b"a lamp")
+    page.get_by_label("A file").set_input_files([{"name": "x", "mimeType": "", "buffer": b"\xff\x00 a lamp"}])
+    page.get_by_role("button", name="Import").press("Enter")
+    assert faults(page) == []
+    page.goto(f"{page.url.partition('#')[0]}#engineer")
+    for note in ("is dark bare", "is dark mine", "is dark /wAgYSBsYW1w"):
+        expect(page.get_by_role("log").get_by_text(note)).to_be_visible()
+    assert asked(lamp.url, f"{urlsplit(lamp.url).path}file/g")[0] == 404
+
+
 def test_things_are_moved_by_mouse_and_by_keys(page: Page) -> None:
     thing = page.get_by_role("button", name="lamp", exact=True)
     thing.scroll_into_view_if_needed()
@@ -200,6 +233,26 @@ def test_a_page_that_stands_still_keeps_nobody_waiting(lamp: Lamp, page: Page) -
             assert asked(lamp.url, f"{place.path}call", "POST", body)[0] == 200
         page.goto(f"{lamp.url}#engineer")
         expect(page.get_by_role("log")).to_contain_text("is dark 199")
+
+
+def test_a_page_need_not_wait_for_the_recorder(page: Page) -> None:
+    blinked = page.get_by_text("has blinked")
+    page.get_by_label("How often").fill("1")
+    with Live(find_run(None)) as live:
+        (recorder,) = [one.pid for one in live.status().processes if one.stage == "recorder"]
+    (before,) = re.findall(r"\d+", blinked.inner_text())
+    after = re.compile(rf"has blinked {int(before) + 1} times")
+    page.wait_for_timeout(500)  # until it has read what there is
+    os.kill(recorder, signal.SIGSTOP)
+    try:
+        page.keyboard.press("Enter")
+        expect(blinked).to_have_text(after)
+    finally:
+        os.kill(recorder, signal.SIGCONT)
+    page.get_by_role("link", name="Engineer").click()
+    expect(page.get_by_text("Answer").first).to_be_visible()
+    page.get_by_role("link", name="Scene").click()
+    expect(blinked).to_have_text(after)
 
 
 def test_escape_stops_wherever_the_focus_is(page: Page) -> None:
@@ -260,10 +313,61 @@ def test_the_texts_of_both_languages_are_the_same_ones() -> None:
     assert asked_for <= english.keys()
 
 
+def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) -> None:
+    for _ in range(2):
+        page.get_by_label("How often").fill("1")
+        page.keyboard.press("Enter")
+    blinked = re.compile(r"has blinked (\d+) times")
+    page.get_by_role("link", name="History").click()
+    page.get_by_role("link", name="Replay").click()
+    then, slider = page.get_by_role("region", name="Then"), page.get_by_label("Moment")
+    expect(then).to_contain_text(blinked)
+    (first,) = blinked.findall(then.inner_text())
+    second = f"has blinked {int(first) + 1} times"
+    expect(page.get_by_role("img", name="A lamp.")).to_be_visible()
+    page.wait_for_function("document.querySelector('figure img').naturalWidth === 64")
+    page.get_by_role("button", name="Next").press("Enter")
+    expect(then).to_contain_text(second)
+    slider.press("ArrowLeft")
+    expect(then).not_to_contain_text(second)
+    expect(slider).to_have_attribute("aria-valuetext", re.compile(rf"\d s: has blinked {first} times"))
+    assert faults(page) == []
+    page.get_by_role("button", name="Play").press("Enter")
+    expect(then).to_contain_text(second)
+    run = page.url.rpartition("/")[2]
+    page.goto(f"{page.url.partition('#')[0]}#history/{run}/lamp.blinked#1")
+    expect(then).to_contain_text("runner why lamp.blinked#1")
+    page.get_by_label("Language").select_option("de")
+    expect(page.get_by_role("region", name="Damals")).to_contain_text(f"{int(first) + 1}-mal geblinkt")
+    path = urlsplit(lamp.url).path
+    assert [asked(lamp.url, f"{path}runs/{one}")[0] for one in (f"{run}/fr.json", "nothing/en.json")] == [422, 404]
+
+
+def test_the_robot_in_3d_comes_from_the_same_address_and_calls_nobody_else(lamp: Lamp, page: Page) -> None:
+    path = urlsplit(lamp.url).path
+    status, html = asked(lamp.url, f"{path}viewer/index.html")
+    assert status == 200 and "re_viewer_bg.wasm" in html
+    assert asked(lamp.url, f"{path}viewer/other.wasm")[0] == 404
+    blink = json.dumps({"stage": "lamp", "command": "blink", "arguments": {"times": "1"}})
+    assert asked(lamp.url, f"{path}call", "POST", blink)[0] == 200
+    name = json.loads(asked(lamp.url, f"{path}runs")[1])[0]["name"]
+    status, reason = asked(lamp.url, f"{path}runs/{name}.rrd")
+    assert status == 422 and "names no views" in reason
+    called = list[str]()
+    page.on("requestfinished", lambda request: called.append(request.url))
+    expect(page.get_by_text("has blinked")).not_to_have_text("has blinked 0 times")
+    page.goto(f"{page.url.partition('#')[0]}#history/{name}")
+    page.get_by_role("button", name="Robot in 3D").press("Enter")
+    viewer = page.frame_locator("iframe[title='Robot in 3D']")
+    expect(viewer.locator("canvas")).to_be_attached()
+    assert all(url.startswith(lamp.url) or url.startswith(("data:", "blob:")) for url in called)
+
+
 def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
     assert runner("goals").communicate(timeout=60)[0] == (
-        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n"
+        "A lamp\n    It blinks.\n    runner call lamp blink times=10\n    runner call lamp switch note=...\n"
     )
+    assert runner("goals", "--graph", str(LAMP)).communicate(timeout=60)[0].startswith("A lamp\n")
     wrong = runner("goals", "A lump")
     assert (wrong.communicate(timeout=60)[0], wrong.returncode) == (
         "A lump: is not remembered; did you mean 'A lamp'? valid: A lamp\n",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -63,8 +63,8 @@ class Lamp(Stage):
 class LampStory:
     hears: tuple[type[Message], ...] = (Blinked, Carry)
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
-        assert list(configs) == ["lamp"]
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
+        assert list(configs) == list(commands) == ["lamp"] and "blink" in commands["lamp"]
         self._blinked, self._place = 0, (0.5, 0.0)
         self._photo = s.Photo("lamp.picture-0", np.full((48, 64, 3), 90, np.uint8))
 
@@ -76,6 +76,9 @@ class LampStory:
                 self._place = (x, y)
             case _:
                 pass
+
+    def recall(self) -> None:
+        self._blinked = 100
 
     def tell(self, language: s.Language) -> s.Told:
         text = {"en": "has blinked {} times", "de": "hat {}-mal geblinkt"}[language].format(self._blinked)
@@ -90,8 +93,9 @@ class LampStory:
         )
         return s.Told(
             s.Doing(text, self._blinked > 0, ("Switches on.", "Switches off."), 1, 1),
+            s.Question("Is it bright?", (s.Action("lamp", "switch", "Very", {"note": "very bright"}),), "unsure"),
             s.Notice(self._blinked < 5, "the lamp is well", ("Let it cool.",), "lamp.blinked#0"),
-            s.View(self._photo, "A lamp.", outlines),
+            s.View(self._photo, "A lamp.", outlines, (s.Arrow("up", (10, 30), (50, 20)),)),
             tuple(s.Statement(f"There is a {one.label}.", one.name, one.surety, one.how_sure) for one in outlines),
             (
                 s.Action("lamp", "blink", "Blink", {}, ask, "first"),
@@ -100,5 +104,14 @@ class LampStory:
             s.Map("Where the lamp is", "Drag it.", ground, places, "lamp", "carry"),
             "Lamps",
             "No lamps.",
-            (s.Card("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),),
+            (
+                s.Card(
+                    *("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),
+                    more=(s.Action("lamp", "switch", "Label", {}, s.Ask("note", "What to write on it")),),
+                    lines=(s.Line("It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),),
+                    lines_title="Its parts",
+                    file=s.File("f", "lamp.txt", "Export", np.frombuffer(b"a lamp", np.uint8)),
+                ),
+            ),
+            (s.Action("lamp", "switch", "Import", {}, s.Ask("note", "A file", kind="file")),),
         )

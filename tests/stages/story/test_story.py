@@ -7,22 +7,29 @@ import string
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
+import msgspec
 import numpy as np
 import pytest
 import yaml
 
 from runner.contract import Message, Refused
+from runner.message.codec import encode
 from runner.page.story import Heard, Language, Notice, Told
 from stages.messages import (
+    Answer,
     Arrange,
     Assertion,
-    Forget,
     Frame,
+    Go,
     Goal,
+    Kept,
     Look,
     LookRequest,
     Move,
     ObjectPose,
+    Pause,
+    Question,
     Restore,
     SceneEstimate,
     SceneGraph,
@@ -32,12 +39,13 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.scene import UnknownRegion
+from stages.messages.scene import Doubt, Stance, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
+from stages.scene.goals import GoalFolder, unpacked, without
 from stages.story import Story, words
 from stages.story.words import words_of
-from tests.stages.episodes import K, outcome, plan, scene, transfer
+from tests.stages.episodes import K, outcome, plan, scene, transfer, translation
 
 CONFIGS: dict[str, dict[str, Any]] = {"demonstrator": {"catalogue": BUILT_IN, "scripted": False}, "world": {}}
 GOAL = scene({"tray": "table", "cup": "tray", "tea_box": "table"}, beside={"tea_box": "tray"})
@@ -50,8 +58,8 @@ LANGUAGES: tuple[Language, ...] = get_args(Language)
 class Listener:
     """A story that is told messages with ids of their own."""
 
-    def __init__(self, **configs: dict[str, Any]) -> None:
-        self.story = Story({**CONFIGS, **configs})
+    def __init__(self, *, brakes: bool = False, **configs: dict[str, Any]) -> None:
+        self.story = Story({**CONFIGS, **configs}, {"executor": ("stop",) if brakes else ()})
         self._heard = 0
 
     def hear(self, *messages: Message, causes: tuple[str, ...] = ()) -> str:
@@ -278,12 +286,48 @@ def test_a_goal_is_taught_and_becomes_a_card() -> None:
     (card,) = listener.told().cards
     assert (card.title, card.text) == ("tea", "3 objects: the tray, the cup and the tea box")
     assert card.photo is not None and card.photo in listener.told().photos
-    assert [(one.command, one.arguments, one.now, one.confirm) for one in card.actions] == [
-        ("restore", {"name": "tea"}, True, ""),
-        ("forget", {"name": "tea"}, True, "Forget “tea” for good?"),
+    assert [(one.command, one.arguments, one.now) for one in card.actions] == [
+        ("restore", {"name": "tea", "ask": "true"}, True)
     ]
-    listener.hear(Forget(name="tea"))
+    assert card.more == card.lines == listener.told().cards_actions == ()
+
+
+def test_a_goal_that_is_kept_can_be_edited_and_carried_away(tmp_path: Path) -> None:
+    listener = Listener(goals={"folder": tmp_path})
+    picture = cv2.imencode(".jpg", np.full((480, 640, 3), 90, np.uint8))[1].tobytes()
+    goal = Goal(name="tea", scene=GOAL, pddl="", picture=picture)
+    listener.hear(Kept(goals=(goal,)))
+    (card,) = listener.told().cards
+    assert card.photo is not None and card.photo.rgb.shape == (480, 640, 3) and abs(card.photo.rgb - 90.0).max() < 3
+    assert [(one.command, one.arguments, one.confirm) for one in card.more] == [
+        ("rename", {"name": "tea"}, ""),
+        ("forget", {"name": "tea"}, "Delete “tea” for good?"),
+    ]
+    assert card.file is not None and card.file.name == "tea.zip"
+    assert encode(unpacked(card.file.data.tobytes())) == encode(goal)
+    assert [(line.text, *(one.arguments.get("what") or one.label for one in line.actions)) for line in card.lines] == [
+        ("The tray is on the table.", "on(tray, table)", "tray"),
+        ("The cup is in the tray.", "in(cup, tray)", "cup"),
+        ("The tea box is on the table.", "on(tea_box, table)", "tea_box"),
+        (
+            "The tea box is next to the tray, within 3 cm of where it was shown.",
+            *("Allow 7 cm", "in(tea_box_near_tray, tea_box)"),
+        ),
+    ]
+    loose = msgspec.structs.replace(goal, scene=without(GOAL, "in(cup, tray)"))
+    listener.hear(Kept(goals=(loose,)))
+    line = listener.told("de").cards[0].lines[1]
+    assert (line.text, [one.label for one in line.actions]) == ("Die Tasse darf überall sein.", ["Die Tasse weglassen"])
+    listener.hear(Kept(goals=()))
     assert listener.told().cards == ()
+
+
+def test_what_is_on_disk_is_told_without_a_run(tmp_path: Path) -> None:
+    GoalFolder(tmp_path).write(Goal(name="tea", scene=GOAL, pddl=""))
+    listener = Listener(goals={"folder": tmp_path})
+    assert listener.told().cards == ()
+    listener.story.recall()
+    assert [card.title for card in listener.told("de").cards] == ["tea"]
 
 
 @pytest.mark.parametrize("command_first", [True, False])
@@ -337,6 +381,72 @@ def test_a_stop_is_told_until_it_has_come() -> None:
     assert (listener.notice.text, listener.notice.good) == ("Stopped, as you asked.", True)
 
 
+def test_a_plan_is_shown_before_go_and_a_pause_holds_the_next() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea", ask=True))
+    listener.seen(START)
+    listener.hear(Task(goal_name="tea", goal=GOAL, current=START))
+    target = msgspec.structs.replace(STEP, T_base_targets=translation(0.8, 0.3, 0.7)[None])
+    listener.hear(plan(target, transfer("tea_box", "table", "table")))
+    assert listener.doing == "Waits for your go; left to move: 2, about 1 min"
+    view = listener.told().view
+    assert view is not None and view.arrows[0].label == "Puts the cup into the tray"
+    assert view.arrows[0].start != view.arrows[0].end
+    assert listener.offered()["go"] and "pause" not in listener.offered()
+    listener.hear(Go(), TransferRequest(transfer=STEP, scene=START, number=1))
+    assert "go" not in listener.offered() and listener.offered()["pause"]
+    assert 39 < listener.told().doing.expected_s < 60
+    listener.hear(Pause())
+    assert listener.doing == "Puts the cup into the tray; then waits for you" and "pause" not in listener.offered()
+    listener.hear(outcome(1, STEP), LookRequest(purpose="after transfer 1"))
+    listener.seen(START)
+    listener.hear(plan(transfer("tea_box", "table", "table")))
+    assert listener.doing == "Waits for your go; left to move: 1, about 1 min" and listener.offered()["go"]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
+    doubts = [
+        *(Doubt(kind="stance", object="cup", stance=stance) for stance in get_args(Stance)),
+        Doubt(kind="unknown", object="", choices=("leave", "again")),
+        Doubt(kind="which", object="cup", choices=("cup", "tea_box", "again")),
+    ]
+    listener, texts = Listener(), set[str]()
+    listener.called(Restore(name="tea", ask=True))
+    listener.seen(GOAL)
+    for number, doubt in enumerate(doubts, 1):
+        listener.hear(Question(number=number, doubt=doubt))
+        asked = listener.told(language).question
+        assert asked is not None and asked.about == (doubt.object or "unknown_0")
+        texts.add(asked.text)
+        assert [one.arguments for one in asked.answers] == [
+            {"question": str(number), "choice": choice} for choice in doubt.choices
+        ]
+        assert len({one.label for one in asked.answers}) == len(doubt.choices)
+        listener.hear(Answer(question=number, choice="perhaps"), Answer(question=number - 1, choice="again"))
+        assert listener.told().question is not None
+        listener.hear(Answer(question=number, choice="again"))
+        assert listener.told().question is None
+    assert len(texts) == len(doubts)
+
+
+@pytest.mark.parametrize("brakes", [True, False])
+def test_an_arm_that_moves_is_stopped_at_once_where_it_can_be(brakes: bool) -> None:
+    listener = Listener(brakes=brakes)
+    listener.taught()
+    listener.called(Restore(name="tea"))
+
+    def who() -> str:
+        return next(one.stage for one in listener.told().actions if one.kind == "stop")
+
+    assert who() == "demonstrator"
+    listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1))
+    assert who() == ("executor" if brakes else "demonstrator")
+    listener.hear(verdict(STOPPED, "stopped, as asked; in the hand: cup"))
+    assert listener.notice.text == "Stopped, as you asked; in the hand is still the cup."
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("stage", ["perception", "planner", "executor"])
 def test_a_failure_says_what_is_wrong_and_what_helps(stage: str, language: Language) -> None:
@@ -351,18 +461,34 @@ def test_a_failure_says_what_is_wrong_and_what_helps(stage: str, language: Langu
     id = listener.hear(verdict(stage, "no room", violated))
     notice = listener.told(language).notice
     assert notice is not None
-    assert (notice.good, notice.message, len(notice.help), "no room" in notice.text) == (False, id, 3, True)
-    assert language != "en" or notice.help[:2] == (
+    assert (notice.good, notice.message, len(notice.help), "no room" in notice.text) == (False, id, 4, True)
+    assert language != "en" or notice.help[1:3] == (
         "The cup should be in the tray.",
         "The tea box should be next to the tray.",
     )
+
+
+def test_what_was_tried_in_vain_is_told() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    listener.seen(START)
+    listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1))
+    listener.hear(outcome(1, STEP, failed_stage="grasp", reason="no way to lift it"), verdict("executor", "no"))
+    assert listener.notice.help[0] == "It came to an end while moving things."
+    assert listener.notice.tried == (
+        "What was tried:",
+        "Puts the cup on the tray: while grasping, it cannot be lifted without touching something",
+    )
+    listener.called(Look())
+    assert listener.told().notice is None
 
 
 def test_what_was_not_remembered_is_said_so() -> None:
     listener = Listener()
     listener.called(Teach(name="tea"))
     listener.hear(verdict("perception", "2 of 6 objects seen"))
-    assert listener.notice.text == "“tea” is not remembered: 2 of 6 objects seen."
+    assert listener.notice.text == "“tea” is not remembered: only 2 of 6 objects were seen."
 
 
 def test_a_scripted_robot_takes_no_commands() -> None:
@@ -374,7 +500,7 @@ def test_a_scripted_robot_takes_no_commands() -> None:
 
 def test_a_graph_without_objects_has_no_story() -> None:
     with pytest.raises(Refused, match="story: none of the stages camera has a setting `catalogue`; objects need one"):
-        Story({"camera": {}})
+        Story({"camera": {}}, {})
 
 
 # ------------------------------------------------------------------------------------------ languages

@@ -1,0 +1,168 @@
+"""Goals on disk and in one file, for people, planners and other robots; and what of a goal may be left out."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from runner.contract import Refused
+from runner.message.codec import CodecError, encode
+from stages.messages import Goal, SceneGraph
+
+SCENE, PDDL, PICTURE = "scene.json", "goal.pddl", "picture.jpg"
+"""The files of a goal. The scene has all of it; the others are the same for planners and for people."""
+MAX_BYTES = 10_000_000
+"""Of a goal."""
+MAX_RADIUS = 0.5
+"""Metres from where it was shown at which an object may still count as next to another."""
+
+
+def default_folder() -> Path:
+    """Where goals are kept unless a graph says otherwise: for the user, whatever the run."""
+    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    return Path(data).expanduser() / "scene-programming" / "goals"
+
+
+def check_name(place: str, name: str) -> None:
+    """Refuses what cannot be the name of a folder."""
+    if not name.replace("-", "").replace("_", "").isalnum():
+        raise Refused(f"{place}: must consist of letters, digits, - and _ only")
+
+
+class GoalFolder:
+    """A folder that holds a folder for each goal. What it holds is read anew each time: others may write to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def read(self) -> tuple[dict[str, Goal], list[str]]:
+        """All goals by name, and why what else is there is none."""
+        goals, faults = dict[str, Goal](), list[str]()
+        for path in sorted(self._folder.glob(f"*/{SCENE}")):
+            name = path.parent.name
+            try:
+                check_name(str(path.parent), name)
+                goals[name] = goal_of(name, {file.name: file.read_bytes() for file in path.parent.iterdir()})
+            except (Refused, OSError) as error:
+                faults.append(f"{path.parent}: {error}")
+        return goals, faults
+
+    def write(self, goal: Goal) -> Path:
+        """Puts a goal in its folder, wholly or not at all; one of that name is replaced."""
+        place, new = self._folder / goal.name, self._folder / f".{goal.name}.new"
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(parents=True)
+        for name, content in files_of(goal).items():
+            (new / name).write_bytes(content)
+        shutil.rmtree(place, ignore_errors=True)
+        return new.rename(place)
+
+    def remove(self, name: str) -> None:
+        """Deletes a goal."""
+        shutil.rmtree(self._folder / name)
+
+
+def files_of(goal: Goal) -> dict[str, bytes]:
+    """What is kept of a goal, by name of file."""
+    scene = msgspec.json.format(msgspec.json.encode(goal.scene, enc_hook=np.ndarray.tolist), indent=1)
+    return {SCENE: scene, PDDL: goal.pddl.encode()} | ({PICTURE: goal.picture} if goal.picture else {})
+
+
+def goal_of(name: str, files: Mapping[str, bytes]) -> Goal:
+    """The goal that was kept; raises Refused where the files are none."""
+    try:
+        scene = msgspec.json.decode(files[SCENE], type=SceneGraph, dec_hook=_array)
+        pddl = files.get(PDDL, b"").decode()
+        goal = Goal(name=name, scene=scene, pddl=pddl, picture=files.get(PICTURE, b""))
+        encode(goal)
+    except KeyError:
+        raise Refused(f"is no goal: it has no {SCENE}") from None
+    except (msgspec.MsgspecError, CodecError, ValueError) as error:
+        raise Refused(f"is no goal: {error}") from None
+    return goal
+
+
+def packed(goal: Goal) -> bytes:
+    """A goal as one file, a zip archive of its folder; equal goals are equal bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files_of(goal).items():
+            archive.writestr(zipfile.ZipInfo(f"{goal.name}/{name}"), content, zipfile.ZIP_DEFLATED)
+    return file.getvalue()
+
+
+def unpacked(file: bytes) -> Goal:
+    """The goal in a packed file; raises Refused where there is none."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(file)) as archive:
+            members = {tuple(one.filename.split("/")): one for one in archive.infolist()}
+            folder = next((path[0] for path in members if len(path) == 2 and path[1] == SCENE), "")
+            if sum(one.file_size for one in members.values()) > MAX_BYTES:
+                raise Refused(f"file: is no goal: unpacked it has more than {MAX_BYTES} bytes")
+            files = {path[1]: archive.read(one) for path, one in members.items() if path[:-1] == (folder,)}
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError):
+        raise Refused("file: is no goal: expected a file that was exported") from None
+    try:
+        return goal_of(folder, files)
+    except Refused as refusal:
+        raise Refused(f"file: {refusal}") from None
+
+
+def _array(kind: Any, value: Any) -> Any:
+    return np.array(value, np.float64)
+
+
+# ------------------------------------------------------------------------------------------ what does not matter
+
+
+def without(scene: SceneGraph, what: str) -> SceneGraph:
+    """A scene without an object, or without one of its relations.
+
+    With an object goes all that is said of it. An object of which it is not said what carries it may be anywhere;
+    regions say where it is on that, so they go with it.
+    """
+    if what in {item.name for item in scene.objects}:
+        regions = {item.name for item in scene.virtual_objects if what in (item.parent, item.child)}
+        kept = tuple(item for item in scene.objects if item.name != what)
+        return _without(msgspec.structs.replace(scene, objects=kept), {what, *regions})
+    found = [item for item in scene.assertions if str(item) == what and item.predicate != "exist"]
+    if not found:
+        valid = [*(item.name for item in scene.objects), *(str(a) for a in scene.assertions if a.predicate != "exist")]
+        raise Refused(f"what={what!r}: neither an object nor a relation of the goal; valid: {', '.join(valid)}")
+    regions = {item.name: item for item in scene.virtual_objects}
+    if region := next((name for name in found[0].arguments if name in regions), None):
+        return _without(scene, {region})
+    rest = msgspec.structs.replace(scene, assertions=tuple(item for item in scene.assertions if item not in found))
+    if found[0].predicate == "clear":
+        return rest
+    return _without(rest, {name for name, item in regions.items() if item.child == found[0].arguments[0]})
+
+
+def _without(scene: SceneGraph, names: Collection[str]) -> SceneGraph:
+    """Without what is said of objects and regions of these names."""
+    return msgspec.structs.replace(
+        scene,
+        virtual_objects=tuple(item for item in scene.virtual_objects if item.name not in names),
+        assertions=tuple(item for item in scene.assertions if not set(names).intersection(item.arguments)),
+    )
+
+
+def loosened(scene: SceneGraph, region: str, radius: float) -> SceneGraph:
+    """A scene in which one region has another radius."""
+    names = [item.name for item in scene.virtual_objects]
+    if region not in names:
+        raise Refused(f"region={region!r}: no such region; valid: {', '.join(names) or 'none'}")
+    if not 0 < radius <= MAX_RADIUS:
+        raise Refused(f"radius={radius}: must be more than 0 and at most {MAX_RADIUS} metres")
+    wider = (
+        msgspec.structs.replace(item, radius=radius) if item.name == region else item for item in scene.virtual_objects
+    )
+    return msgspec.structs.replace(scene, virtual_objects=tuple(wider))

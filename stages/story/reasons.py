@@ -1,0 +1,75 @@
+"""Why something did not work, as stages say it in a line, in the words of a language."""
+
+from __future__ import annotations
+
+import re
+
+from stages.story.words import Words
+
+_NAMES = r"(?P<names>\w+(?:, \w+)*)"
+_ITEM, _OTHER, _PLACE = r"(?P<item>\w+)", r"(?P<other>\w+)", r"(?P<place>\w+)"
+_NUMBER, _OF = r"(?P<number>[\d.]+)", r"(?P<of>[\d.]+)"
+REASONS = {
+    "stopped_empty": r"stopped, as asked; in the hand: nothing",
+    "stopped_holding": rf"stopped, as asked; in the hand: {_NAMES}",
+    "stopped": r"stopped, as asked",
+    "too_few": rf"{_NUMBER} of {_OF} objects seen",
+    "floats": rf"not seen: what carries {_NAMES}",
+    "unseen": rf"not seen: {_NAMES}",
+    "looks": rf" \({_NUMBER} looks at scene '[^']*'\)",
+    "enough": rf"{_NUMBER} transfers were not enough; ",
+    "replaced": rf"the plan was replaced {_NUMBER} times",
+    "nothing_to_do": r"the planner finds nothing to do, yet relations are violated",
+    "no_transfer": r"no transfer changes what is violated: every object is where the goal has it",
+    "no_other_way": r"; no other way: ",
+    "missing": rf"the goal needs {_NAMES}, not in the current scene",
+    "circle": rf"in the goal {_NAMES} rest on each other in a circle",
+    "must_move": rf"{_ITEM} would have to move from {_OTHER} to {_PLACE}, but it ",
+    "must_move_beside": rf"{_ITEM} would have to move beside {_OTHER}, but it ",
+    "must_move_off": rf"{_ITEM} on {_OTHER} would have to move, but it ",
+    "no_grasp": r"has no grasp in the catalogue",
+    "too_wide": rf"is {_NUMBER} cm wide and the gripper takes {_OF} cm",
+    "no_room_on_table": rf"no room on the table for {_ITEM} within reach",
+    "no_room": rf"no room for {_ITEM} at {_OTHER} within reach",
+    "in_the_way": rf": {_NAMES} in the way",
+    "make_room": rf"{_NAMES} would have to make room and cannot",
+    "no_order": rf"no sequence of transfers moves {_NAMES} while nothing cannot be moved",
+    "no_sequence": rf"no sequence of transfers moves {_NAMES} while (?P<fixed>\w+(?:, \w+)*) cannot be moved",
+    "not_beside": rf"in\({_ITEM}_near_{_OTHER}, \w+\) does not hold",
+    "not_on": rf"(?:on|in)\({_ITEM}, {_OTHER}\) does not hold",
+    "not_clear": rf"clear\({_ITEM}\) does not hold",
+    "not_there": rf"exist\({_ITEM}\) does not hold",
+    "not_seen_on": rf"{_ITEM} is not seen on or in {_OTHER}",
+    "closed": rf"the fingers closed to {_NUMBER} mm instead of {_OF}",
+    "opened": rf"the hand opened to {_NUMBER} mm of {_OF}",
+    "not_home": r"no free motion home; too close: .*",
+    "no_catalogue": r"the catalogue has no grasp for it",
+    "unreachable": r"no grasp of it is reachable without a collision",
+    "no_approach": r"no straight approach to a grasp",
+    "no_lift": r"no way to lift it",
+    "no_motion": r"no free motion to the pre-grasp",
+    "no_carry": r"no free motion that carries it to the target",
+    "no_posture": r"no reachable posture above the target",
+    "no_way_down": r"no free way down to the target",
+    "no_way_out": r"no free way out after letting go",
+    "at_ik": r"\bik: ",
+    "at_pick": r"\bpick motion: ",
+    "at_grasp": r"\bgrasp: ",
+    "at_place": r"\bplace motion: ",
+    "at_release": r"\brelease: ",
+}
+"""What stages say, by the key of what people are told instead. The longer comes first."""
+_NUMBERS = ("number", "of")
+
+
+def told(reason: str, words: Words) -> str:
+    """A reason in the words of a language; what is not known stays as the stage said it."""
+    for key, pattern in REASONS.items():
+        reason = re.sub(pattern, lambda match, key=key: words.part(f"because_{key}", **_parts(match, words)), reason)
+    return reason
+
+
+def _parts(match: re.Match[str], words: Words) -> dict[str, object]:
+    return {
+        name: text if name in _NUMBERS else words.nouns(text.split(", ")) for name, text in match.groupdict().items()
+    }

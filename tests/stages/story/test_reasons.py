@@ -1,0 +1,64 @@
+"""Why something did not work, as stages say it, in the words of people."""
+
+from __future__ import annotations
+
+import pytest
+
+from stages.story.reasons import REASONS, told
+from stages.story.words import words_of
+
+SAID = {
+    "stopped, as asked": "angehalten, wie gewünscht",
+    "stopped, as asked; in the hand: tea_box": "angehalten, wie gewünscht; in der Hand ist noch die Teeschachtel",
+    "2 of 6 objects seen (3 looks at scene 'goal')": "nur 2 von 6 Dingen waren zu sehen, nach 3-mal Hinsehen",
+    "not seen: cup, tea_box": "nicht zu sehen: die Tasse und die Teeschachtel",
+    "not seen: what carries soup_can (1 looks at scene 'start')": (
+        "unter der Suppendose war nichts zu sehen, nach 1-mal Hinsehen"
+    ),
+    "16 transfers were not enough; in(tea_box_near_tray, tea_box) does not hold": (
+        "nach 16 Bewegungen ist es noch nicht geschafft: die Teeschachtel ist nicht neben dem Tablett"
+    ),
+    "3 transfers were not enough; on(cup, tray) does not hold": (
+        "nach 3 Bewegungen ist es noch nicht geschafft: die Tasse ist nicht, wo es hingehört, auf oder in dem Tablett"
+    ),
+    "grasp: the fingers closed to 5 mm instead of 60; no other way: no room on the table for cup within reach: "
+    "tray, mug in the way": (
+        "beim Greifen: die Finger schlossen sich auf 5 mm statt 60 mm, um nichts oder etwas anderes; "
+        "es gibt keinen anderen Weg: für die Tasse ist auf dem Tisch kein Platz in Reichweite; "
+        "im Weg: das Tablett und der Becher"
+    ),
+    "tray would have to move from table to cup, but it is 31.0 cm wide and the gripper takes 9.5 cm": (
+        "das Tablett müsste von dem Tisch weg, hin zu der Tasse, aber das Ding ist 31.0 cm breit, "
+        "und die Hand fasst 9.5 cm"
+    ),
+    "no sequence of transfers moves cup while nothing cannot be moved": (
+        "die Tasse lässt sich in keiner Reihenfolge dorthin bringen"
+    ),
+    "release: cup is not seen on or in tray": "beim Loslassen: die Tasse ist nicht auf oder in dem Tablett zu sehen",
+    "the goal needs cup_2, not in the current scene": "es fehlt: die Tasse 2",
+}
+"""With what is said of it in German."""
+
+
+@pytest.mark.parametrize("reason", SAID)
+def test_what_stages_say_is_said_in_german(reason: str) -> None:
+    assert told(reason, words_of("de")) == SAID[reason]
+
+
+@pytest.mark.parametrize("reason", SAID)
+def test_no_names_of_the_catalogue_are_left(reason: str) -> None:
+    for language in ("en", "de"):
+        assert "_" not in told(reason, words_of(language))
+
+
+def test_what_is_not_known_stays_as_it_was_said() -> None:
+    assert told("the sky fell on it", words_of("de")) == "the sky fell on it"
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_every_reason_has_its_words(language: str) -> None:
+    texts = words_of(language)  # type: ignore[arg-type]
+    for key in REASONS:
+        parts = dict.fromkeys(("item", "other", "place"), texts.noun("cup"))
+        names = dict.fromkeys(("names", "fixed"), texts.nouns(["cup", "tray"]))
+        assert texts.part(f"because_{key}", **parts, **names, number="3", of="6")
