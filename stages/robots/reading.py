@@ -156,7 +156,7 @@ def _servo(joint: Section) -> Servo | None:
 def _gripper(section: Section) -> Gripper:
     section.only(
         "link", "position", "rotation", "near", "fingers", "followers", "widths", "closed_width", "open_width",
-        "widest", "length", "thickness", "finger", "pads", "servo",
+        "widest", "pads", "servo",
     )  # fmt: skip
     followers = section.section("followers") if "followers" in section.values else None
     table = section.items("widths")
@@ -175,9 +175,6 @@ def _gripper(section: Section) -> Gripper:
         closed_width=section.number("closed_width", 0.0),
         open_width=section.number("open_width", low=0),
         widest=section.number("widest", low=0),
-        length=section.number("length", low=0),
-        thickness=section.number("thickness", low=0),
-        finger=section.number("finger", low=0),
     )
 
 

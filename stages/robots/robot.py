@@ -55,11 +55,6 @@ class Gripper:
     """Metres between the fingers at most."""
     widest: float
     """Width in metres of the widest object that the fingers take between them."""
-    length: float
-    thickness: float
-    """Metres along the approach, and across it and the closing direction: the room that hand and fingers take."""
-    finger: float
-    """Metres beside an object that an opening finger takes."""
 
     def width(self, finger: float) -> float:
         """Metres between the fingers at a finger joint's position, also a little beyond its range."""
