@@ -23,6 +23,7 @@ from stages.planning.pick_place import (
     RELEASE,
     ROOM,
     Errand,
+    Pick,
     PickPlace,
     PickPlacePlanner,
     Place,
@@ -49,6 +50,8 @@ _CONTACT = 0.001
 """Metres that the hand must lag behind while it is lowered to count as contact."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
+_ASIDE = 0.012
+"""Metres by which the hand evades to either side when a finger comes down on the object: as much as there is room."""
 _RUB = 15.0
 """Newtons that do not matter where the hand leaves what it has let go of."""
 _EMPTY = 0.003
@@ -221,18 +224,59 @@ class TransferRoutine:
         self._tally.grasp = grasp.name
         yield from self._do("open the hand", width=opening(world, grasp, ROOM))
         yield from self._do(f"reach for {world.carried}", plan.reach, guard=Guard(force=_BUMP))
-        close = f"close on {world.carried}"
-        state = yield from self._do(close, plan.pick.approach, speed=_SLOW, width=0.0, guard=Guard(force=_TOUCH))
+        state, lift = yield from self._take(world, plan.pick)
         if not self._is_held(state, grasp):
             return (yield from self._back_off(world, plan, state))
         self.in_hand = world.carried
         self._log(f"{world.carried}: grasped with {grasp.name!r}, {1e3 * state.gripper_width:.0f} mm wide")
         narrowest, widest = self._held_between(grasp)
         lifting = Guard(narrowest=narrowest, widest=widest)
-        yield from self._do(f"lift {world.carried}", plan.pick.lift, speed=_SLOW, guard=lifting)
+        yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
         weight = _G * self._objects[world.carried][0].mass
         yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + weight))
         return (yield from self._put_down(at, plan.place, guard=replace(lifting, force=_TOUCH + weight)))
+
+    def _take(
+        self, world: CollisionWorld, pick: Pick
+    ) -> Generator[RobotCommand, RobotState, tuple[RobotState, Floats]]:
+        """Closes the hand on the object, and says how to lift it.
+
+        The object is not quite where it was estimated: where a finger comes down on it, the hand tries beside that.
+        """
+        label, guard = f"close on {world.carried}", Guard(force=_TOUCH)
+        evasions = self._evasions(world, pick)
+        approach, lift = pick.approach, pick.lift
+        while True:
+            try:
+                state = yield from self._do(label, approach, speed=_SLOW, width=0.0, guard=guard)
+            except _BrokenOff as broken:
+                evasion = next(evasions, None) if broken.state.stopped == "touch" else None
+                if evasion is None:
+                    raise
+                self._log(f"{broken}; tries beside it")
+                q = self._arm(broken.state)
+                back = np.vstack([q, approach[: np.abs(approach - q).max(1).argmin()][::-1]])
+                yield from self._do("back off", back, speed=_SLOW)
+                approach, lift = evasion
+            else:
+                return state, lift
+
+    def _evasions(self, world: CollisionWorld, pick: Pick) -> Iterator[tuple[Floats, Floats]]:
+        """The same approach, and the lift that follows, with the hand moved along its closing direction."""
+        hand = pick.hand
+        for metres in (_ASIDE, -_ASIDE):
+            shift = np.eye(4)
+            shift[1, 3] = metres
+            world.set_width(opening(world, hand.grasp, ROOM))
+            with world.touching(world.carried):
+                beside = straight_motion(world, pick.approach[0], hand.T_base_prehand @ shift)
+                down = None if beside is None else straight_motion(world, beside[-1], hand.T_base_hand @ shift)
+            if beside is None or down is None:
+                continue
+            rise = straight_motion(world, down[-1], raised(hand.T_base_hand @ shift, LIFT), free=False)
+            if rise is not None:
+                approach = np.vstack([pick.approach[:1], beside[1:], down[1:]])
+                yield approach, np.vstack([rise, pick.lift[-1:]])
 
     def _back_off(self, world: CollisionWorld, plan: PickPlace, state: RobotState) -> Steps:
         """Out of a grasp that closed on nothing."""

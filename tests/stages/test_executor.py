@@ -256,6 +256,17 @@ def test_an_object_that_falls_from_the_hand_is_noticed_at_once() -> None:
     assert bench.is_home()
 
 
+def test_what_is_not_quite_where_it_was_seen_is_grasped_beside_that() -> None:
+    bench = Bench(0, "tea")
+    seen, target = bench.poses(), bench.poses()["cup"]
+    seen["cup"][:2, 3] += 0.012
+    target[0, 3] += 0.02
+    outcome = bench.transfer(seen, "cup", "table", target)
+    assert outcome.success, outcome.reason
+    assert any("tries beside it" in line for line in bench.ctx.lines)
+    assert np.linalg.norm(bench.poses()["cup"][:2, 3] - target[:2, 3]) < 0.02
+
+
 def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> None:
     bench = Bench(0, "tea")
     before = bench.poses()
