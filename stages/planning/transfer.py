@@ -50,6 +50,8 @@ _CONTACT = 0.001
 """Metres that the hand must lag behind while it is lowered to count as contact."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
+_PRESS = 12.0
+"""Newtons from which on a finger does not slip past the object but stands on it."""
 _ASIDE = 0.012
 """Metres by which the hand evades to either side when a finger comes down on the object: as much as there is room."""
 _RUB = 15.0
@@ -243,7 +245,7 @@ class TransferRoutine:
 
         The object is not quite where it was estimated: where a finger comes down on it, the hand tries beside that.
         """
-        label, guard = f"close on {world.carried}", Guard(force=_TOUCH)
+        label, guard = f"close on {world.carried}", Guard(force=_PRESS)
         evasions = self._evasions(world, pick)
         approach, lift = pick.approach, pick.lift
         while True:
