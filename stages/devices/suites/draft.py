@@ -10,6 +10,7 @@ from stages.devices import tabletop
 from stages.devices.tabletop import Layout
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import inverse
 from stages.geometry.regions import Region
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
@@ -103,6 +104,22 @@ class Draft:
     def carriers(self) -> list[str]:
         """What may carry one thing more: hollows, and flat tops on which nothing stands and that are not too high."""
         return [name for name, item in self.placed.items() if item.stance.cavity or self._is_free_top(item)]
+
+    def has_room_beside(self, goal: Draft) -> bool:
+        """Whether what stands beside something in ``goal`` that the hand cannot take would have room there here."""
+        for name, fixed in self.placed.items():
+            if fixed.stance.item.grasps or name not in goal.placed:
+                continue
+            there = goal.placed[name]
+            T = fixed.T_table_object @ inverse(there.T_table_object)
+            beside = (
+                Standing.at(other.name, self._shapes[label_of(other.name, self._catalogue)], T @ other.T_table_object)
+                for other in goal.placed.values()
+                if goal.supports[other.name] == TABLE and regions.gap(other.outline, there.outline) < BESIDE
+            )
+            if not all(self._is_carried(item, TABLE) for item in beside if item.name != name):
+                return False
+        return True
 
     def _take_away(self, name: str) -> None:
         self.placed.pop(name, None)

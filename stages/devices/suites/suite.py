@@ -63,6 +63,8 @@ class Drawn(Suite):
 
     def __init__(self, catalogue: Catalogue, robot: Robot, seed: int) -> None:
         self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
+        self._goal: Draft | None = None
+        """The newest: what a start must leave room for."""
         self.choose(np.random.default_rng([seed, 2]))
 
     @abstractmethod
@@ -86,6 +88,10 @@ class Drawn(Suite):
         self.draw(kind, draft, rng)
         if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
+        if kind == "goal":
+            self._goal = draft
+        elif self._goal is not None and not self._goal.has_room_beside(draft):
+            raise Rejected("no room beside what cannot be moved")
         return draft.layout
 
 

@@ -143,6 +143,19 @@ def test_what_stands_where_no_hand_fits_is_stuck() -> None:
     assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
 
 
+def test_what_belongs_beside_the_tray_needs_room_there() -> None:
+    def draft(x: float, y: float) -> Draft:
+        made = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=1.0)
+        assert made.put_at("tray", "table", np.array([x, y]), np.pi / 2)
+        return made
+
+    goal = draft(0.7, 0.0)
+    depth = np.ptp(goal.placed["tray"].outline[:, 0])
+    assert goal.put_at("salt_shaker", "table", np.array([0.7 - depth / 2 - 0.04, 0.0]), 0.0)
+    assert draft(0.7, 0.1).has_room_beside(goal)
+    assert not draft(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0).has_room_beside(goal)
+
+
 def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
     with pytest.raises(Refused, match=r"world\.suite: no suite 'neat'; choose one of tray, wild, swap"):
         World.Config(suite="neat")
