@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from math import pi
 from pathlib import Path
 from typing import Literal
 
@@ -47,7 +48,7 @@ from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import corrected, open_doubt
 from stages.scene.goals import check_name
 from stages.scene.relations import Tolerances, hanging
-from stages.scene.stance import Stances, standing_of
+from stages.scene.stance import TIPPED, Stances, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
 
@@ -90,6 +91,8 @@ class State:
     """What is missing of it, in words."""
     scene: SceneGraph | None = None
     """As it was looked at last, completed from memory."""
+    first: SceneGraph | None = None
+    """The scene in which the restoring began."""
     known: Mapping[str, SceneObject] = field(default_factory=dict[str, SceneObject])
     """Where each object was last seen or placed since the scene was arranged, by name. Never changed, only replaced."""
     remembered: tuple[str, ...] = ()
@@ -289,6 +292,7 @@ class Demonstrator(Stage):
         self._state = replace(
             self._state,
             scene=scene,
+            first=self._state.first or (scene if self._state.goal is not None else None),
             known={item.name: item for item in scene.objects},
             remembered=tuple(sorted(_names(scene) - _names(scene_graph))),
             looks=self._state.looks + 1,
@@ -539,6 +543,8 @@ class Demonstrator(Stage):
         goal = state.whole or state.goal
         if goal is not None and state.scene is not None:
             held, violated = satisfied(goal, state.scene, self._catalogue)
+        if fallen := self._fallen():
+            reason = f"{reason}; knocked over: {', '.join(fallen)}"
         phase = Phase.DONE if self._config.scripted else Phase.IDLE
         self._state = replace(state, phase=phase, question=None, shown=None, waits="", plan=None)
         return Verdict(
@@ -552,6 +558,20 @@ class Demonstrator(Stage):
             plans=state.plans,
             transfers=state.transfers,
         )
+
+    def _fallen(self) -> list[str]:
+        """What lies and stands neither as at the start nor as in the goal; upside down nothing falls."""
+        state = self._state
+        if state.scene is None or state.first is None or state.goal is None:
+            return []
+        before = [{item.name: item.T_base_object for item in one.objects} for one in (state.first, state.goal)]
+
+        def lies(item: SceneObject) -> bool:
+            poses = [poses[item.name] for poses in before if item.name in poses]
+            angles = [turned(self._catalogue[item.label], item.T_base_object, T) for T in poses]
+            return bool(angles) and all(TIPPED < angle < pi - TIPPED for angle in angles)
+
+        return [item.name for item in state.scene.objects if lies(item)]
 
 
 class KeepingDemonstrator(Demonstrator):

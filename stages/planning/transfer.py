@@ -37,8 +37,8 @@ Routine = Generator[RobotCommand, RobotState, "Outcome"]
 Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]
 """Yields commands, receives encoders, returns the failed stage ("" for success) and the reason."""
 
-_CLEARANCES = (0.006, 0.002)
-"""Metres: a plan with ample clearance is looked for first."""
+_CLEARANCES = (0.015, 0.006, 0.002)
+"""Metres: a plan with ample clearance, as much as an uncalibrated camera is off, is looked for first."""
 _FAST, _SLOW = 0.7, 0.4
 """Share of the joint limits for free motions and for motions next to objects."""
 _LOWERING_STEP = 0.002

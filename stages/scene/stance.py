@@ -28,6 +28,8 @@ DISH_DEPTH = 0.004
 """Least depth of a hollow, metres."""
 DISH_FILL = 0.9
 """Share of the rays over the floor that must end low: a bottle's shoulders surround its neck, not a hollow."""
+TIPPED = np.deg2rad(30.0)
+"""Angle by which an object's upward direction has turned if it was knocked over."""
 
 
 @dataclass(frozen=True)
@@ -276,3 +278,9 @@ def standing_of(objects: Iterable[SceneObject], stances: Mapping[str, Stances], 
     """Objects of a scene graph where they stand."""
     T_table_base = inverse(T_base_table)
     return [Standing.at(item.name, stances[item.label], T_table_base @ item.T_base_object) for item in objects]
+
+
+def turned(item: CatalogueObject, A: Floats, B: Floats) -> float:
+    """Radians between the sides of an object that are up in two poses (4 x 4), modulo its symmetries."""
+    ups = B[2, :3] @ item.symmetries.transforms()[:, :3, :3]
+    return float(np.arccos(np.clip((ups @ A[2, :3]).max(), -1.0, 1.0)))

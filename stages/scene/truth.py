@@ -19,15 +19,13 @@ from stages.scene.catalogue import Catalogue
 from stages.scene.naming import unique_names
 from stages.scene.relations import Tolerances, assertions, supports
 from stages.scene.scoring import label_of, matched
-from stages.scene.stance import Stances, standing_of
+from stages.scene.stance import TIPPED, Stances, standing_of, turned
 from stages.scene.virtual import satisfied
 
 _BELOW = 0.02
 """Metres below the table's surface from which on an object has left the table."""
 _STAYED = 0.03
 """Metres within which an object of no goal stays where it stood."""
-_TIPPED = np.cos(np.deg2rad(30.0))
-"""Cosine of the angle by which an object's upward direction has turned if it was knocked over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +156,7 @@ class Truth:
 
     def _alike(self, name: str, A: Floats, B: Floats) -> bool:
         """Whether the same side of an object is up, modulo its symmetries."""
-        turned = B[2, :3] @ self._catalogue[label_of(name, self._catalogue)].symmetries.transforms()[:, :3, :3]
-        return bool((turned @ A[2, :3]).max() > _TIPPED)
+        return turned(self._catalogue[label_of(name, self._catalogue)], A, B) < TIPPED
 
 
 def _poses(snapshot: Snapshot) -> dict[str, Floats]:

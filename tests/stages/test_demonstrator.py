@@ -10,7 +10,7 @@ from runner.contract import Command, Message, Refused
 from stages.demonstrator import Demonstrator, KeepingDemonstrator, change_of_plan
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, pose
 from stages.messages import (
     Answer,
     Arrangement,
@@ -33,7 +33,7 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.scene import Doubt
+from stages.messages.scene import Doubt, SceneObject
 from stages.messages.task import STOPPED
 from stages.scene.virtual import without
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
@@ -144,6 +144,21 @@ def test_shows_disturbs_and_restores_a_goal() -> None:
     verdict = the_verdict(episode.seen(GOAL))
     assert verdict.success and not verdict.violated and len(verdict.satisfied) == len(GOAL.assertions)
     assert (verdict.looks, verdict.plans, verdict.transfers) == (3, 1, 1)
+
+
+def test_what_was_knocked_over_is_named_though_every_relation_holds() -> None:
+    episode = Episode()
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    lying = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    name = GOAL.objects[-1].name
+
+    def lain(item: SceneObject) -> SceneObject:
+        return msgspec.structs.replace(item, T_base_object=pose(lying, item.T_base_object[:3, 3]))
+
+    objects = tuple(lain(item) if item.name == name else item for item in GOAL.objects)
+    verdict = the_verdict(episode.seen(msgspec.structs.replace(GOAL, objects=objects)))
+    assert verdict.reason.endswith(f"; knocked over: {name}")
 
 
 def test_remembers_the_goal_as_pddl_by_name() -> None:
