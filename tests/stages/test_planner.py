@@ -406,7 +406,8 @@ def test_what_makes_room_is_not_put_where_the_room_is_needed():
 def test_what_hides_something_is_put_where_it_hides_nothing_of_that():
     current = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2)
     goal = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2).put("salt_shaker", 0.1, 0.0)
-    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=current.graph(), aside="milk_carton"))
+    task = Task(goal_name="goal", goal=goal.graph(), current=current.graph(), aside="milk_carton")
+    found = planner().on_task(task, Recorded())
     (transfer,) = found.transfers
     assert (transfer.object, transfer.source, transfer.destination) == ("milk_carton", "table", "table")
     behind = Standing.at("salt_shaker", stances("salt_shaker"), goal.poses["salt_shaker"])
