@@ -31,13 +31,10 @@ def hiders(missing: Sequence[Stances], scene: Scene, movable: Collection[str], h
     on something unseen, and comes first. Of a stack the top is moved first.
     """
     scores: dict[str, float] = {}
-    for name in scene.standing:
-        lowest = heights[name] - scene.standing[name].z_bottom
-        share = (
-            np.inf
-            if lowest > _HANGS
-            else float(sum(_hides(name, places, scene) for places in _imagined(missing, scene)))
-        )
+    imagined = list(_imagined(missing, scene))
+    for name, item in scene.standing.items():
+        hangs = heights[name] - item.z_bottom > _HANGS
+        share = np.inf if hangs else float(sum(_hides(name, place, scene) for place in imagined))
         top = _top(name, scene)
         if share > 0 and top in movable:
             scores[top] = max(share, scores.get(top, 0.0))

@@ -179,9 +179,8 @@ class TransferRoutine:
                 return (yield from self._put_back(at, q))
         yield from self._do("open the hand", width=self._robot.gripper.open_width)
         self.in_hand = ""
-        nearest = np.abs(at.plan.pick.approach - q).max(1)
-        if nearest.min() < _AWAY:
-            back = np.vstack([q, at.plan.pick.approach[: nearest.argmin()][::-1]])
+        distance, back = _back(at.plan.pick.approach, q)
+        if distance < _AWAY:
             yield from self._do("back off", back, speed=_SLOW)
             q = back[-1]
         return (yield from self._home(at.world, q))
@@ -256,8 +255,7 @@ class TransferRoutine:
                 if evasion is None:
                     raise
                 self._log(f"{broken}; tries beside it")
-                q = self._arm(broken.state)
-                back = np.vstack([q, approach[: np.abs(approach - q).max(1).argmin()][::-1]])
+                _, back = _back(approach, self._arm(broken.state))
                 yield from self._do("back off", back, speed=_SLOW)
                 approach, lift = evasion
             else:
@@ -450,3 +448,9 @@ class TransferRoutine:
             T_base_object=tally.T_base_object,
             held=self.in_hand,
         )
+
+
+def _back(approach: Floats, q: Floats) -> tuple[float, Floats]:
+    """How far joint positions (J) are from an approach (W x J), radians, and the way back along it, from them on."""
+    distances = np.abs(approach - q).max(1)
+    return float(distances.min()), np.vstack([q, approach[: distances.argmin()][::-1]])
