@@ -85,8 +85,9 @@ class Simulation:
         for name, T in layout.items():
             self._put(name, T)
         self.present = tuple(name for name in self._names if name in layout)
-        for k, name in enumerate(name for name in self._names if name not in layout):
-            self._data.joint(name).qpos[:3] = _AWAY[0], _AWAY[1] * k, self._robot.floor + 0.1
+        for name in self._names:
+            if name not in layout:
+                self._put_away(name)
         self.run(settle)
 
     def place(self, name: str, T_base_object: Floats, *, settle: float = 1.0) -> None:
@@ -99,6 +100,11 @@ class Simulation:
         joint.qpos[:] = np.concatenate([T_base_object[:3, 3] + [0, 0, _DROP], quaternion(T_base_object[:3, :3])])
         joint.qvel[:] = 0
 
+    def _put_away(self, name: str) -> None:
+        """Each to a place of its own."""
+        place = _AWAY[0], _AWAY[1] * self._names.index(name), self._robot.floor + 0.1
+        self._put(name, pose(np.eye(3), np.array(place)))
+
     def add(self, name: str, T_base_object: Floats) -> None:
         """Puts an object down that may have been out of the way."""
         self.place(name, T_base_object, settle=0.0)
@@ -106,9 +112,7 @@ class Simulation:
 
     def remove(self, name: str) -> None:
         """Puts an object out of the way and out of sight."""
-        self._put(
-            name, pose(np.eye(3), np.array([_AWAY[0], _AWAY[1] * self._names.index(name), self._robot.floor + 0.1]))
-        )
+        self._put_away(name)
         self.present = tuple(one for one in self.present if one != name)
 
     def touching(self, name: str) -> set[str]:
