@@ -325,7 +325,7 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     (first,) = blinked.findall(then.inner_text())
     second = f"has blinked {int(first) + 1} times"
     expect(page.get_by_role("img", name="A lamp.")).to_be_visible()
-    page.wait_for_function("document.querySelector('figure img').naturalWidth === 64")
+    expect(page.locator("figure img").first).to_have_js_property("naturalWidth", 64)
     page.get_by_role("button", name="Next").press("Enter")
     expect(then).to_contain_text(second)
     slider.press("ArrowLeft")
