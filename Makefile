@@ -1,6 +1,8 @@
 # `make up` runs the main job, `make test` passes the tests; both set up what they need on a bare machine.
 PYTHON ?= python3
 BIN := .venv/bin
+# Two files of tests at a time: most wait for processes more than they compute.
+PYTEST := $(BIN)/pytest --numprocesses 2 --dist loadfile
 STAMP := .venv/.installed
 SET ?=
 export PYOPENGL_PLATFORM ?= egl
@@ -33,10 +35,10 @@ lint: setup
 	$(BIN)/lint-imports
 
 test: lint  ## format, lint, strict types, import layers and every test: what CI runs
-	$(BIN)/pytest
+	$(PYTEST)
 
 fast: setup  ## the fast tests only
-	$(BIN)/pytest -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
 bench: setup  ## speed of the kernel
 	$(BIN)/python -m benchmarks.kernel
