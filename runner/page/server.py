@@ -21,7 +21,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -243,13 +243,20 @@ class Page:
         return Response(await run_in_threadpool(_jpeg, photo), media_type="image/jpeg")
 
     async def _drawn(self, request: Request) -> Response:
-        """A recording for the viewer of the robot in 3D."""
+        """A recording for the viewer of the robot in 3D; that of the run that is shown grows as it goes on."""
+        pieces = viewer.drawn(self._recording(request))
         try:
-            return Response(
-                await run_in_threadpool(viewer.drawn, self._recording(request)), media_type="application/octet-stream"
-            )
+            first = await anext(pieces)
         except Refused as refusal:
             return PlainTextResponse(str(refusal), 422)
+
+        async def whole() -> AsyncGenerator[bytes]:
+            async with contextlib.aclosing(pieces):
+                yield first
+                async for piece in pieces:
+                    yield piece
+
+        return StreamingResponse(whole(), media_type="application/octet-stream")
 
     async def _viewer(self, request: Request) -> Response:
         """A file of that viewer; they are large, and there once somebody has asked for one."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
+import contextlib
 import hashlib
 import re
 import socket
@@ -10,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import AsyncGenerator
 from importlib.util import find_spec
 from pathlib import Path
 from urllib.error import URLError
@@ -17,6 +20,7 @@ from urllib.request import urlopen
 
 from runner.contract import Refused
 from runner.process.children import bound
+from runner.recording.container import is_being_written, open_file
 
 FILES = {
     "index.html": "text/html",
@@ -27,7 +31,7 @@ _SERVES = "import rerun, sys; rerun.serve_web_viewer(web_port=int(sys.argv[1]), 
 """The viewer is inside of Rerun's library, which gives it out over HTTP alone."""
 _SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
 START_SECONDS = 20.0
-DRAW_SECONDS = 300.0
+PIECE_BYTES = 1 << 18
 
 
 def viewer_files() -> dict[str, bytes]:
@@ -71,12 +75,27 @@ def policy(html: bytes) -> str:
     )
 
 
-def drawn(recording: Path) -> bytes:
-    """A recording as Rerun reads it, by `runner view`; raises Refused where that cannot draw it."""
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "drawn.rrd"
-        command = bound([sys.executable, "-m", "runner.cli", "view", str(recording), "--save", str(target)])
-        done = subprocess.run(command, capture_output=True, text=True, timeout=DRAW_SECONDS, check=False)
-        if done.returncode or not target.exists():
-            raise Refused((done.stderr or done.stdout).strip().rpartition("\n")[2] or "the viewer has drawn nothing")
-        return target.read_bytes()
+async def drawn(recording: Path) -> AsyncGenerator[bytes]:
+    """A recording as Rerun reads it, by ``runner view``, and what is added to it while its graph runs.
+
+    The first piece comes once there is something to see; raises Refused instead where nothing can be drawn.
+    """
+    with open_file(recording) as file:
+        live = ["--live"] if is_being_written(file) else []
+    command = [sys.executable, "-m", "runner.cli", "view", str(recording), *live, "--save", "-"]
+    with tempfile.TemporaryFile() as said:
+        process = await asyncio.create_subprocess_exec(*bound(command), stdout=asyncio.subprocess.PIPE, stderr=said)
+        assert process.stdout is not None
+        try:
+            piece = await process.stdout.read(PIECE_BYTES)
+            if not piece:
+                said.seek(0)
+                lines = said.read().decode().strip()
+                raise Refused(lines.rpartition("\n")[2] or "the viewer has drawn nothing")
+            while piece:
+                yield piece
+                piece = await process.stdout.read(PIECE_BYTES)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()

@@ -53,10 +53,10 @@ def view_recording(path: Path, *, save: Path | None = None, png: Path | None = N
 
 
 def save_rrd(recording: Recording, target: Path) -> None:
-    """Draws a whole recording into a Rerun file."""
+    """Draws a whole recording into a Rerun file, ``-`` for stdout."""
     stream = _stream(recording.path)
-    stream.save(target)
     canvas = Canvas(recording.run["graph"], recording.path, stream)
+    _write(stream, target)
     for sealed in recording.envelopes():
         canvas.draw(sealed)
     stream.flush()
@@ -67,14 +67,26 @@ def _stream(path: Path) -> rr.RecordingStream:
     return rr.RecordingStream("scene programming", recording_id=path.stem)
 
 
+def _write(stream: rr.RecordingStream, target: Path) -> None:
+    stream.stdout() if target == Path("-") else stream.save(target)
+
+
 # ------------------------------------------------------------------------------------ live
 
 
-def view_live(path: Path | None = None) -> None:
-    """Shows a graph while it runs: ``path`` is its recording, by default the one in ``recordings`` being written."""
+def view_live(path: Path | None = None, save: Path | None = None) -> None:
+    """Shows a graph while it runs, in a viewer or a file that grows with it.
+
+    ``path`` is its recording, by default the one in ``recordings`` being written.
+    """
     path = path or newest_live(Path("recordings"))
     # The graph comes first: drawing, and the viewer that this starts, take what it leaves of the cores.
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    if save is not None:
+        stream = _stream(path)
+        follow(path, stream, begin=lambda: _write(stream, save))
+        stream.disconnect()
+        return
     port = _free_port()
     viewer = _start_viewer(port, "--expect-data-soon")
     try:
@@ -94,13 +106,23 @@ def newest_live(folder: Path) -> Path:
     raise Refused(f"{folder}: no graph is running here: no recording is being written")
 
 
-def follow(path: Path, stream: rr.RecordingStream, *, stopped: Callable[[], bool] = lambda: False) -> None:
-    """Draws what a recording holds and goes on as it grows, until its graph has ended or ``stopped()``."""
+def follow(
+    path: Path,
+    stream: rr.RecordingStream,
+    *,
+    begin: Callable[[], None] = lambda: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> None:
+    """Draws what a recording holds and goes on as it grows, until its graph has ended or ``stopped()``.
+
+    ``begin`` is called once it is known what to draw.
+    """
     canvas: Canvas | None = None
     with open_file(path) as file:
         for record in Container(Growing(file, stopped), str(path)):
             if isinstance(record, Metadata) and record.name == RUN:
                 canvas = Canvas(record.metadata["graph"], path, stream)
+                begin()
             elif isinstance(record, Entry) and payload_kind(record.topic) is Envelope and canvas is not None:
                 with contextlib.suppress(CodecError):
                     canvas.draw(unpack(Envelope, record.message.data))

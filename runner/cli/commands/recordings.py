@@ -55,7 +55,7 @@ def _view(options: argparse.Namespace) -> None:
     from runner.view.rerun_view import view_live, view_recording
 
     if options.live:
-        view_live(options.file)
+        view_live(options.file, options.save)
     elif options.file is None:
         raise Refused("runner view: name a recording, or --live")
     else:

@@ -1,7 +1,7 @@
 // The recordings beside the running one, and one of them told again.
 
 import {html, nothing} from "./lit-html.js";
-import {lasted, size} from "./parts.js";
+import {lasted, size, solid} from "./parts.js";
 import {notice, question, statements, view} from "./scene.js";
 
 const WORDS = {COMPLETE: "complete", INCOMPLETE: "incomplete"};
@@ -73,19 +73,8 @@ function replayed(page, past) {
       <p class="quiet">${page.say("ask_engineer")} <code>runner why ${moment.message} ${past.name}.mcap</code></p>
     </section></div>
     ${statements(page, moment)}
-    ${solid(page, past)}
+    ${solid(page, past, past.name)}
   </div>`;
-}
-
-/** The robot and what it sees in 3D, in Rerun's viewer: large, so only once it is wanted. */
-function solid(page, past) {
-  const wanted = () => { past.solid = !past.solid; page.draw(); };
-  const drawing = new URL(`runs/${past.name}.rrd`, location.href).href.split("#")[0];
-  return html`<section class="solid" aria-label=${page.say("solid")}>
-    <button aria-expanded=${past.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
-    ${past.solid ? html`<iframe title=${page.say("solid")}
-      src="viewer/index.html?hide_welcome_screen&persist=0&url=${encodeURIComponent(drawing)}"></iframe>` : nothing}
-  </section>`;
 }
 
 /** Goes through the moments as they came, but waits for none of them long. */

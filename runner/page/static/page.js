@@ -26,6 +26,7 @@ const page = {
   log: [],
   runs: null, // recordings; null until they were asked for
   past: null, // the recording that is told again: its name, its moments, the one that is shown
+  solid: false, // whether the robot is shown in 3D
   marked: "", // the outline that is pointed at
   refused: {}, // why a command could not be called, by stage.command
 

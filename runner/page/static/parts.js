@@ -49,3 +49,14 @@ export function size(bytes) {
   const power = Math.min(3, Math.max(0, Math.floor(Math.log10(Math.max(1, bytes)) / 3)));
   return `${(bytes / 1000 ** power).toFixed(power ? 1 : 0)} ${["B", "kB", "MB", "GB"][power]}`;
 }
+
+/** The robot and what it sees in 3D, in Rerun's viewer: large, so only once it is wanted, which `holder.solid` says. */
+export function solid(page, holder, recording) {
+  const wanted = () => { holder.solid = !holder.solid; page.draw(); };
+  const drawing = new URL(`runs/${recording}.rrd`, location.href).href.split("#")[0];
+  return html`<section class="solid" aria-label=${page.say("solid")}>
+    <button aria-expanded=${holder.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
+    ${holder.solid ? html`<iframe title=${page.say("solid")}
+      src="viewer/index.html?hide_welcome_screen&persist=0&url=${encodeURIComponent(drawing)}"></iframe>` : nothing}
+  </section>`;
+}

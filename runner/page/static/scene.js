@@ -2,7 +2,7 @@
 
 import {html, nothing, svg} from "./lit-html.js";
 import {map} from "./map.js";
-import {button, lasted} from "./parts.js";
+import {button, lasted, solid} from "./parts.js";
 
 const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
 const BOW = 50; // by which an arrow rises, in the same pixels
@@ -22,6 +22,7 @@ export function scene(page) {
     ${statements(page, told)}
     ${told.map ? map(page, told.map) : nothing}
     ${told.cards_title ? cards(page, told) : nothing}
+    ${page.run ? solid(page, page, page.run.name) : nothing}
   </div>`;
 }
 

@@ -1,3 +1,4 @@
+import asyncio
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from PIL import Image
 from runner.contract import Refused
 from runner.graph.graph import load_graph
 from runner.message.codec import Envelope, envelope
+from runner.page.viewer import drawn
 from runner.recording.recording import Recording
 from runner.recording.writer import RecordingWriter
 from runner.view.rerun_view import follow, newest_live, save_rrd, screenshot, view_recording
@@ -83,6 +85,28 @@ def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
     assert "/camera/boxes" in entities(tmp_path / "live.rrd")
     with pytest.raises(Refused, match="no graph is running"):
         newest_live(tmp_path)
+
+
+def test_a_page_is_sent_what_a_running_graph_adds(tmp_path: Path):
+    path = tmp_path / "live.mcap"
+    recorder = RecordingWriter(manifest(load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}", VIEW)), path), print)
+
+    def record(value: int) -> None:
+        own = f"counter.number#{value}"
+        put(recorder, envelope(Number(value=value), id=own, lineage=own, time_ns=value, causes=()))
+
+    async def read() -> bytes:
+        pieces, value = drawn(path), 0
+        record(value)
+        found = await asyncio.wait_for(anext(pieces), 60)
+        while b"/camera/boxes" not in found:
+            record(value := value + 1)
+            found += await asyncio.wait_for(anext(pieces), 60)
+        recorder.close()
+        return found + b"".join([piece async for piece in pieces])
+
+    (tmp_path / "page.rrd").write_bytes(asyncio.run(read()))
+    assert "/camera/boxes" in entities(tmp_path / "page.rrd")
 
 
 def test_the_viewer_listens_on_loopback_only(monkeypatch: pytest.MonkeyPatch):
