@@ -576,6 +576,8 @@ def _check_edge(document: Document, graph: Graph, name: str, port: str) -> None:
     edge, wanted = graph.nodes[name].inputs[port], graph.nodes[name].type.inputs[port]
     if edge.stage != SUPERVISOR and edge.stage not in graph.nodes:
         raise Refused(f"{place}: no stage {edge.stage!r}{suggest(edge.stage, graph.nodes)}")
+    if edge.stage == name:
+        raise Refused(f"{place}: {name} cannot be its own input: with its queue full it would wait for itself")
     outputs = graph.outputs_of(edge.stage)
     given = outputs.get(edge.port)
     if given is None:

@@ -303,7 +303,8 @@ def _new_recording(folder: Path, name: str) -> tuple[str, Path]:
         if run in taken:
             continue
         try:
-            (folder / run / "log").mkdir(parents=True)
+            (folder / run).mkdir(parents=True)
+            (folder / run / "log").mkdir()
         except FileExistsError:
             continue
         except OSError as error:

@@ -54,6 +54,7 @@ def test_a_good_graph_loads(tmp_path: Path):
             "total: gatherer.totl",
             ":22: stages.sink.inputs.total: gatherer has no output 'totl'; did",
         ),
+        ("total: gatherer.total", "total: sink.total", ":22: stages.sink.inputs.total: sink cannot be its own input"),
         (
             "total: gatherer.total",
             "total: worker.answer",
