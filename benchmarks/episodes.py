@@ -19,11 +19,11 @@ from typing import TypeVar
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from stages.devices.suites import kinds
-from stages.messages import Goal, Outcome, Snapshot, Verdict
+from stages.messages import Correction, Goal, Outcome, Snapshot, Verdict
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.truth import Judgement, Truth
 
-M = TypeVar("M", Goal, Outcome, Snapshot, Verdict)
+M = TypeVar("M", Correction, Goal, Outcome, Snapshot, Verdict)
 ROOT = Path(__file__).parents[1]
 SUITES: dict[str, tuple[str, ...]] = {"tray": ()} | {name: (f"world.suite={name}",) for name in kinds.DRAWN}
 """Settings by suite: ``tray`` is what the graph lays out as it stands."""
@@ -39,6 +39,7 @@ class Episode:
     verdict: Verdict | None
     judgement: Judgement
     outcomes: tuple[Outcome, ...]
+    corrections: tuple[Correction, ...]
     complete: bool
     reason: str
     recording: Path
@@ -54,7 +55,7 @@ class Episode:
             "objects_lost": len(losses),
             "objects_lost_unsaid": sum(not loss.said for loss in losses),
             "transfers": len(self.outcomes),
-            "robot_seconds": round(sum(outcome.robot_seconds for outcome in self.outcomes), 2),
+            "robot_seconds": round(sum(one.robot_seconds for one in (*self.outcomes, *self.corrections)), 2),
             "wall_seconds": round(self.seconds, 2),
             "failing_stage": self.failing_stage,
             "reason": "" if self.code == 0 else self.reason,
@@ -91,13 +92,14 @@ def judged(path: Path, *, seed: int, code: int, seconds: float, reason: str) -> 
     """An episode as its recording tells it."""
     recording = Recording(path)
     verdict = next(iter(_messages(recording, Verdict)), None)
-    outcomes = tuple(_messages(recording, Outcome))
+    outcomes, corrections = tuple(_messages(recording, Outcome)), tuple(_messages(recording, Correction))
     judgement = Judgement(claimed=False)
     if verdict is not None:
         goal = next((goal for goal in _messages(recording, Goal) if goal.name == verdict.goal_name), None)
         snapshots = list(_messages(recording, Snapshot))
         judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
-    return Episode(seed, code, seconds, verdict, judgement, outcomes, recording.verdict.complete, reason, path)
+    complete = recording.verdict.complete
+    return Episode(seed, code, seconds, verdict, judgement, outcomes, corrections, complete, reason, path)
 
 
 def _messages(recording: Recording, kind: type[M]) -> Iterator[M]:
@@ -147,12 +149,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("seeds", type=int, nargs="+")
     parser.add_argument("--suite", choices=SUITES, default="tray", help="kind of scenes")
     parser.add_argument("--graph", type=Path, default=ROOT / "graph.yaml")
+    parser.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE")
     parser.add_argument("--json", type=Path, help="file to write, one object per seed")
     options = parser.parse_args(arguments)
     print(HEADER)
     episodes: list[Episode] = []
     for seed in options.seeds:
-        episodes.append(run(seed, options.graph, SUITES[options.suite]))
+        episodes.append(run(seed, options.graph, (*SUITES[options.suite], *options.set)))
         print(row(episodes[-1]), flush=True)
         if options.json:
             summaries = [{"suite": options.suite, **episode.summary()} for episode in episodes]

@@ -15,6 +15,7 @@ from runner.contract import Context, Refused, Stage
 from stages.messages import (
     Answer,
     Arrangement,
+    Arrived,
     Asked,
     Assertion,
     Go,
@@ -351,6 +352,13 @@ class Demonstrator(Stage):
             return self._stopped(ctx)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
         return self._look(f"after transfer {outcome.number}")
+
+    def on_arrived(self, arrived: Arrived, ctx: Context) -> Verdict | None:
+        """The arm shows itself before a look is taken; who stops it then wants no look."""
+        if arrived.stopped != STOPPED or self._state.phase is not Phase.LOOKING:
+            return None
+        self._state = replace(self._state, halted=True)
+        return self._conclude(STOPPED, arrived.reason, ctx)
 
     def _recovered(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict:
         """The arm is at home again, or not."""

@@ -1,4 +1,4 @@
-"""Transfers in, robot commands and outcomes out: picks and places with what was perceived, nothing else."""
+"""Transfers and postures in, robot commands and outcomes out: with what was perceived, nothing else."""
 
 from __future__ import annotations
 
@@ -9,17 +9,28 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from runner.contract import Context, Refused, Stage
-from stages.messages import Brake, Halt, Outcome, Recover, RobotCommand, RobotState, TransferRequest
+from stages.messages import (
+    Arrived,
+    Brake,
+    Halt,
+    Outcome,
+    PostureRequest,
+    Recover,
+    RobotCommand,
+    RobotState,
+    TransferRequest,
+)
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 if TYPE_CHECKING:
+    from stages.planning.posture import Homecoming, Motion, PostureRoutine
     from stages.planning.transfer import Routine, TransferRoutine
 
 
 class Executor(Stage):
-    """Drives one transfer at a time; every robot state answers the command before it."""
+    """Drives one transfer, or one motion into a posture, at a time; every robot state answers the command before it."""
 
     device = True
 
@@ -37,23 +48,24 @@ class Executor(Stage):
 
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
+        from stages.planning.posture import PostureRoutine
         from stages.planning.transfer import TransferRoutine
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
         self._robot = read_robot(config.robot)
-        self._transfers = TransferRoutine
-        self._transfer: TransferRoutine | None = None
+        self._transfers, self._postures = TransferRoutine, PostureRoutine
+        self._routine: TransferRoutine | PostureRoutine | None = None
         """The newest one."""
-        self._steps: Routine | None = None
+        self._steps: Routine | Motion | Homecoming | None = None
         """What is under way."""
         self._halted = False
         self._ctx: Context | None = None
 
-    def on_transfer_request(self, transfer_request: TransferRequest, ctx: Context) -> RobotCommand | Outcome:
+    def on_transfer_request(self, transfer_request: TransferRequest, ctx: Context) -> RobotCommand | Outcome | Arrived:
         """Starts a transfer: the first command reads the encoders."""
         self._ctx = ctx
-        self._transfer = self._transfers(
+        self._routine = self._transfers(
             transfer_request,
             robot=self._robot,
             table=self._robot.table,
@@ -62,15 +74,21 @@ class Executor(Stage):
             attempts=self._config.attempts,
             log=self._log,
         )
-        return self._begin(self._transfer.run())
+        return self._begin(self._routine.run())
 
-    def on_recover(self, recover: Recover, ctx: Context) -> RobotCommand | Outcome:
+    def on_posture_request(self, posture_request: PostureRequest, ctx: Context) -> RobotCommand | Outcome | Arrived:
+        """Brings the arm into a posture."""
+        self._ctx = ctx
+        self._routine = self._postures(posture_request, robot=self._robot, rng=ctx.rng, log=self._log)
+        return self._begin(self._routine.run())
+
+    def on_recover(self, recover: Recover, ctx: Context) -> RobotCommand | Outcome | Arrived:
         """Brings the arm home after a stop."""
         self._ctx = ctx
-        assert self._transfer is not None  # Only what was asked for can have been stopped.
-        return self._begin(self._transfer.recover())
+        assert self._routine is not None  # Only what was asked for can have been stopped.
+        return self._begin(self._routine.recover())
 
-    def on_robot_state(self, robot_state: RobotState, ctx: Context) -> RobotCommand | Outcome | None:
+    def on_robot_state(self, robot_state: RobotState, ctx: Context) -> RobotCommand | Outcome | Arrived | None:
         """Continues the transfer; states that answer no command of this stage are ignored."""
         if self._steps is None:
             return None
@@ -87,14 +105,14 @@ class Executor(Stage):
 
     def close(self) -> None:
         """Says what is in the hand of an arm that was under way."""
-        if self._steps is not None and self._transfer is not None:
-            self._log(f"stopped on the way; {self._transfer.in_hand or 'nothing'} is in the hand")
+        if self._steps is not None and self._routine is not None:
+            self._log(f"stopped on the way; {self._routine.in_hand or 'nothing'} is in the hand")
 
-    def _begin(self, steps: Routine) -> RobotCommand | Outcome:
+    def _begin(self, steps: Routine | Motion | Homecoming) -> RobotCommand | Outcome | Arrived:
         self._steps, self._halted = steps, False
         return self._advance(None)
 
-    def _advance(self, state: RobotState | None) -> RobotCommand | Outcome:
+    def _advance(self, state: RobotState | None) -> RobotCommand | Outcome | Arrived:
         assert self._steps is not None
         try:
             return next(self._steps) if state is None else self._steps.send(state)

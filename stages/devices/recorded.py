@@ -19,7 +19,9 @@ class RecordedFrames:
         from runner.recording.recording import Recording
 
         self._recording = Recording(path)
-        self._ids = [id for id, message in self._recording.messages.items() if message.type == Frame.__name__]
+        ids = [id for id, message in self._recording.messages.items() if message.type == Frame.__name__]
+        # What a corrector passed on is what was looked at; the camera's own frames are there as well.
+        self._ids = [id for id in ids if id.startswith("corrector.")] or ids
         if not self._ids:
             types = sorted({message.type for message in self._recording.messages.values()})
             raise Refused(f"{path}: holds no message of type Frame; there are {', '.join(types) or 'none at all'}")

@@ -7,6 +7,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 """
 
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
+from stages.messages.correction import Arrived, Calibrate, Correction, PostureRequest
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
 from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
 from stages.messages.robot import Brake, RobotCommand, RobotState
@@ -41,12 +42,15 @@ __all__ = [
     "Answer",
     "Arrange",
     "Arrangement",
+    "Arrived",
     "Asked",
     "Assertion",
     "Box",
     "Brake",
+    "Calibrate",
     "Candidate",
     "Candidates",
+    "Correction",
     "Depth",
     "Forget",
     "Frame",
@@ -70,6 +74,7 @@ __all__ = [
     "Pose",
     "Poses",
     "Posterior",
+    "PostureRequest",
     "Question",
     "Recover",
     "Rename",

@@ -4,6 +4,7 @@ from typing import Literal
 
 from runner.contract import Command, Message, Struct
 from stages.messages.arrays import Pose, Poses
+from stages.messages.correction import Arrived
 from stages.messages.scene import Assertion, Doubt, SceneGraph
 
 FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release", "slip", "touch", "unknown", "stop"]
@@ -184,7 +185,7 @@ class Stop(Command, frozen=True, kw_only=True):
 class Halt(Command, frozen=True, kw_only=True):
     """Stops the arm at once, where it is. What it holds it goes on holding; the answer says what that is."""
 
-    answers = (Outcome,)
+    answers = (Outcome, Arrived)
 
 
 class Arrange(Command, frozen=True, kw_only=True):

@@ -41,7 +41,9 @@ def quaternion(R: Floats) -> Floats:
 
 
 class CollisionWorld:
-    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried.
+    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried, if any.
+
+    ``occupied`` are pieces in the base frame that nobody has named yet.
 
     The hand frame is the catalogue's grasp frame: x is the approach direction, y the closing direction, the origin
     lies between the fingertips. ``clearance`` (metres, at most :data:`AMPLE`) is kept from everything except what
@@ -54,15 +56,16 @@ class CollisionWorld:
         table: Table,
         objects: Mapping[str, tuple[CatalogueObject, Floats]],
         *,
-        carried: str,
+        carried: str = "",
+        occupied: tuple[Primitive, ...] = (),
         clearance: float = 0.005,
     ) -> None:
         self.robot, self.carried, self.checks = robot, carried, 0
         self.objects = {name: entry for name, (entry, _) in objects.items()}
-        self._model = self._compile(table, objects)
+        self._model = self._compile(table, objects, occupied)
         self._data = mujoco.MjData(self._model)
         self._index_robot()
-        self._geoms = {name: self._geoms_of(name) for name in ("table", *objects)}
+        self._geoms = {name: self._geoms_of(name) for name in ("table", "occupied", *objects)}
         self._held_geoms = self._geoms_of("held")
         self._obstacles = [geom for geoms in self._geoms.values() for geom in geoms]
         self._model.geom_margin[self._obstacles] = clearance
@@ -166,7 +169,12 @@ class CollisionWorld:
         finally:
             self._model.geom_contype[geoms] = before
 
-    def _compile(self, table: Table, objects: Mapping[str, tuple[CatalogueObject, Floats]]) -> Any:
+    def _compile(
+        self,
+        table: Table,
+        objects: Mapping[str, tuple[CatalogueObject, Floats]],
+        occupied: tuple[Primitive, ...],
+    ) -> Any:
         spec = self.robot.specification(seen=False)
         hand = spec.body(self.robot.hand)
         links = {hand.name, *(body.name for body in hand.find_all(mujoco.mjtObj.mjOBJ_BODY))}
@@ -174,6 +182,7 @@ class CollisionWorld:
             near_hand = 0 if geom.parent.name in links else _HELD
             geom.contype, geom.conaffinity = _ROBOT, _ROBOT | _NEAR_ROBOT | near_hand
         obstacles = [add_table(spec, table)]
+        obstacles += add_primitives(spec.worldbody.add_body(name="occupied"), occupied)
         for name, (entry, T) in objects.items():
             body = spec.worldbody.add_body(name=name, mocap=True, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
             obstacles += add_primitives(body, entry.collision)
@@ -184,7 +193,8 @@ class CollisionWorld:
         hand = spec.body(gripper.link).add_body(
             name="hand frame", pos=T_link_hand[:3, 3], quat=quaternion(T_link_hand[:3, :3])
         )
-        for geom in add_primitives(hand.add_body(name="held"), objects[self.carried][0].collision):
+        held = objects[self.carried][0].collision if self.carried else ()
+        for geom in add_primitives(hand.add_body(name="held"), held):
             geom.contype, geom.conaffinity, geom.mass = 0, 0, 1e-6
         return spec.compile()
 

@@ -18,6 +18,8 @@ import ompl.util as ou
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
+from stages.messages import RobotCommand, RobotState
+from stages.messages.robot import Guard
 from stages.planning.collision import CollisionWorld, quaternion
 from stages.robots import Robot
 
@@ -35,6 +37,8 @@ _LARGEST_JUMP = 0.35
 """Radians between waypoints of a straight hand motion; more means a change of configuration."""
 _STRAIGHT_STEP = 0.01
 """Metres between waypoints of a straight hand motion."""
+FAST = 0.7
+"""Share of the joint limits for free motions."""
 _RESOLUTION = 0.02
 """Largest joint motion between collision checks of a path, radians (metres)."""
 _CHECKS = 15_000
@@ -150,7 +154,38 @@ def densify(waypoints: Floats, step: float) -> Floats:
     return np.array(dense)
 
 
-def time_parameterise(robot: Robot, waypoints: Floats, *, speed: float = 0.7) -> Trajectory:
+def robot_command(
+    robot: Robot,
+    label: str,
+    waypoints: Floats | None = None,
+    *,
+    speed: float = FAST,
+    width: float | None = None,
+    guard: Guard | None = None,
+) -> RobotCommand:
+    """A trajectory through ``waypoints`` (W x J), then a gripper width; either may be absent."""
+    if waypoints is None:
+        none = np.zeros((0, len(robot.joints)))
+        return RobotCommand(times=np.zeros(0), positions=none, velocities=none, gripper_width=width, label=label)
+    motion = time_parameterise(robot, waypoints, speed=speed)
+    return RobotCommand(
+        joint_names=robot.joints,
+        times=motion.times,
+        positions=motion.positions,
+        velocities=motion.velocities,
+        gripper_width=width,
+        label=label,
+        guard=guard,
+    )
+
+
+def arm(robot: Robot, state: RobotState) -> Floats:
+    """Positions (J) of the joints that planning moves."""
+    where = dict(zip(state.joint_names, state.positions, strict=True))
+    return np.array([where[name] for name in robot.joints])
+
+
+def time_parameterise(robot: Robot, waypoints: Floats, *, speed: float = FAST) -> Trajectory:
     """Fastest traversal of ``waypoints`` (W x J) within ``speed`` times the joint limits (TOPP-RA, Pham 2018)."""
     points = densify(waypoints, _SPLINE_STEP)
     if len(points) < 2:

@@ -16,7 +16,7 @@ from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
-from stages.planning.motion import free_motion, straight_motion, time_parameterise
+from stages.planning.motion import FAST, arm, free_motion, robot_command, straight_motion
 from stages.planning.pick_place import (
     HOVER,
     LIFT,
@@ -39,8 +39,8 @@ Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]
 
 _CLEARANCES = (0.015, 0.006, 0.002)
 """Metres: a plan with ample clearance, as much as an uncalibrated camera is off, is looked for first."""
-_FAST, _SLOW = 0.7, 0.4
-"""Share of the joint limits for free motions and for motions next to objects."""
+_SLOW = 0.4
+"""Share of the joint limits for motions next to objects."""
 _LOWERING_STEP = 0.002
 _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
@@ -391,15 +391,14 @@ class TransferRoutine:
         return float(world.hand(self._arm(state))[2, 3] - world.hand(q)[2, 3])
 
     def _arm(self, state: RobotState) -> Floats:
-        where = {name: index for index, name in enumerate(state.joint_names)}
-        return state.positions[[where[name] for name in self._robot.joints]]
+        return arm(self._robot, state)
 
     def _do(
         self,
         label: str,
         waypoints: Floats | None = None,
         *,
-        speed: float = _FAST,
+        speed: float = FAST,
         width: float | None = None,
         guard: Guard | None = None,
     ) -> Generator[RobotCommand, RobotState, RobotState]:
@@ -408,29 +407,11 @@ class TransferRoutine:
         Raises:
             _BrokenOff: it was stopped on the way.
         """
-        state = yield self._command(label, waypoints, speed=speed, width=width, guard=guard)
+        state = yield robot_command(self._robot, label, waypoints, speed=speed, width=width, guard=guard)
         self._tally.clock = state.time
         if state.stopped:
             raise _BrokenOff(state, label)
         return state
-
-    def _command(
-        self, label: str, waypoints: Floats | None, *, speed: float, width: float | None, guard: Guard | None
-    ) -> RobotCommand:
-        """A trajectory through ``waypoints`` (W x J), then a gripper width; either may be absent."""
-        if waypoints is None:
-            none = np.zeros((0, len(self._robot.joints)))
-            return RobotCommand(times=np.zeros(0), positions=none, velocities=none, gripper_width=width, label=label)
-        motion = time_parameterise(self._robot, waypoints, speed=speed)
-        return RobotCommand(
-            joint_names=self._robot.joints,
-            times=motion.times,
-            positions=motion.positions,
-            velocities=motion.velocities,
-            gripper_width=width,
-            label=label,
-            guard=guard,
-        )
 
     def _outcome(self, failed_stage: FailedStage, reason: str) -> Outcome:
         tally, transfer = self._tally, self._request.transfer

@@ -53,6 +53,7 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
+from stages.messages.correction import OWN_ARM
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.messages.task import Question as AskedQuestion
@@ -64,7 +65,7 @@ from stages.story.cards import GOALS, NAME, Remembered, add, card
 from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, EXECUTOR, WORLD = "demonstrator", "executor", "world"
+DEMONSTRATOR, EXECUTOR, WORLD, CORRECTOR = "demonstrator", "executor", "world", "corrector"
 """Stages that take commands, as our graphs call them."""
 STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
@@ -147,8 +148,11 @@ class Story:
         match heard.message:
             case Teach() | Restore() | Look() as command:
                 self._ask(command, heard)
+            case LookRequest(purpose=look) | Frame(name=look) if look.startswith(OWN_ARM):
+                pass
             case LookRequest():
-                self._begin(heard)
+                if not heard.id.startswith(f"{CORRECTOR}."):  # which passes on what was heard before
+                    self._begin(heard)
             case Frame() as frame:
                 self._photo = Photo(heard.id.replace("#", "-"), frame.rgb)
                 self._estimate = self._scene = None

@@ -14,6 +14,7 @@ from stages.geometry.poses import inverse, pose
 from stages.messages import (
     Answer,
     Arrangement,
+    Arrived,
     Go,
     Goal,
     Kept,
@@ -664,3 +665,14 @@ def test_what_slipped_is_tried_again_as_it_was() -> None:
         episode.ended(number, STEP, failed_stage="slip", reason="the fingers are 2 mm apart on the way to lift cup")
         (task,) = episode.seen(START)
         assert isinstance(task, Task) and task.avoid == ()
+
+
+def test_whoever_stops_the_arm_while_it_shows_itself_wants_no_look() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Look())
+    on_its_way = Arrived(success=False, reason="", joint_names=(), positions=np.zeros(0), robot_seconds=1.0)
+    assert episode.stage.on_arrived(on_its_way, episode.ctx) is None
+    stopped = msgspec.structs.replace(on_its_way, stopped="stop", reason="as asked on the way to show the arm")
+    verdict = episode.stage.on_arrived(stopped, episode.ctx)
+    assert verdict is not None and (verdict.failed_stage, verdict.reason) == (STOPPED, stopped.reason)
+    assert episode.called(Look()) == [Recover()]

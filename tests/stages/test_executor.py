@@ -15,9 +15,11 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3
 from stages.messages import (
     Arrangement,
+    Arrived,
     Halt,
     LookRequest,
     Outcome,
+    PostureRequest,
     Recover,
     RobotCommand,
     RobotState,
@@ -27,6 +29,8 @@ from stages.messages import (
 )
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
+from stages.planning.collision import CollisionWorld
+from stages.planning.posture import postures_in_view
 from stages.robots import BUILT_IN, read_robot
 from stages.world import World
 from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, standing
@@ -68,9 +72,11 @@ class Bench:
             object=name, source="table", destination=destination, T_base_targets=target[None], pick="", place=""
         )
         request = TransferRequest(transfer=transfer, scene=graph(poses, self.robot.table.height), number=1)
-        return self.played(self.executor.on_transfer_request(request, self.ctx))
+        outcome = self.played(self.executor.on_transfer_request(request, self.ctx))
+        assert isinstance(outcome, Outcome)
+        return outcome
 
-    def played(self, answer: RobotCommand | Outcome) -> Outcome:
+    def played(self, answer: RobotCommand | Outcome | Arrived) -> Outcome | Arrived:
         while isinstance(answer, RobotCommand):
             following = self.executor.on_robot_state(self.does(answer), self.ctx)
             assert following is not None
@@ -217,9 +223,34 @@ def test_a_stop_reaches_the_arm_on_its_way_and_what_it_held_goes_back() -> None:
     with pytest.raises(Refused, match="not under way"):
         bench.executor.on_stop(Halt(), bench.ctx)
     home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
-    assert (home.success, home.number, home.held) == (True, 0, "")
+    assert isinstance(home, Outcome) and (home.success, home.number, home.held) == (True, 0, "")
     assert bench.is_home()
     assert np.linalg.norm(bench.poses()["soup_can"][:3, 3] - before["soup_can"][:3, 3]) < 0.01
+
+
+def test_the_arm_may_be_stopped_on_its_way_into_a_posture_and_comes_home() -> None:
+    bench = Bench(0, "tea")
+    q = next(postures_in_view(CollisionWorld(ROBOT, ROBOT.table, {}), np.random.default_rng(0), 1))
+    request = PostureRequest(
+        joint_names=ROBOT.joints, positions=q, table_height=ROBOT.table.height, occupied=np.zeros((0, 6)), label="show"
+    )
+
+    def stop(label: str) -> None:
+        if label == "show" and bench.simulation.time > bench.states[-1].time + 0.5:
+            bench.world.on_brake(bench.executor.on_stop(Halt(), bench.ctx))
+            bench.meddle = lambda label: None
+
+    bench.meddle = stop
+    stopped = bench.played(bench.executor.on_posture_request(request, bench.ctx))
+    assert isinstance(stopped, Arrived) and (stopped.success, stopped.stopped) == (False, "stop")
+    assert stopped.reason == "as asked on the way to show" and 0.5 < stopped.robot_seconds < 1.0
+    bench.simulation.run(1.0)
+    home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
+    assert isinstance(home, Outcome) and home.success and bench.is_home()
+    there = bench.played(bench.executor.on_posture_request(request, bench.ctx))
+    assert isinstance(there, Arrived) and there.success
+    where = dict(zip(there.joint_names, there.positions, strict=True))
+    assert np.allclose([where[name] for name in ROBOT.joints], q, atol=0.02)
 
 
 def test_a_stop_between_two_motions_is_heard() -> None:

@@ -39,6 +39,7 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
+from stages.messages.correction import OWN_ARM
 from stages.messages.scene import Doubt, Stance, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -340,6 +341,18 @@ def test_a_command_may_be_recorded_before_or_after_what_it_causes(command_first:
     for one in heard if command_first else reversed(heard):
         listener.story.hear(one)
     assert listener.doing == "Looks at what there is to do for “tea”"
+
+
+def test_looks_at_the_own_arm_are_told_as_the_look_that_waits_for_them() -> None:
+    listener = Listener()
+    listener.hear(Look())
+    look = LookRequest(purpose="look")
+    listener.story.hear(Heard(look, "demonstrator.look_request#0", ("stage.port#1",), 5))
+    before = listener.doing
+    shown = f"{OWN_ARM}, posture 1 of 4"
+    listener.hear(LookRequest(purpose=shown), msgspec.structs.replace(frame(), name=shown))
+    listener.story.hear(Heard(look, "corrector.look_request#1", ("demonstrator.look_request#0",), 6))
+    assert listener.doing == before
 
 
 def test_a_command_that_was_refused_changes_nothing() -> None:

@@ -1,0 +1,1 @@
+"""The robot's own arm as what its camera is corrected by."""

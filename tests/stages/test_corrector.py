@@ -1,0 +1,120 @@
+"""The corrector: a robot with known errors, rendered, moves and looks at its own arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.correction import Lab
+from runner.contract import Refused
+from stages.corrector import Corrector, Phase, State
+from stages.estimate import Quiet
+from stages.geometry.arrays import Floats
+from stages.geometry.poses import rotation_angle
+from stages.messages import Arrived, Calibrate, Correction, Frame, LookRequest, PostureRequest
+from stages.messages.robot import Stopped
+from stages.robots import BUILT_IN
+
+HAND_CAMERA = BUILT_IN.with_name("ur5e_hand.yaml")
+CTX = Quiet()
+LOOK = LookRequest(purpose="goal")
+
+
+def frame(*, T_base_camera: Floats | None = None) -> Frame:
+    return Frame(
+        rgb=np.zeros((4, 6, 3), np.uint8), depth=np.ones((4, 6), np.float32), K=np.eye(3), T_base_camera=T_base_camera,
+        robot_mask=None, name="goal", index=0, total=0,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_finds_what_is_wrong_with_the_camera_and_corrects_every_look() -> None:
+    lab = Lab("tray", 340)
+    seen = lab.look("goal")
+    lab.close()
+    errors, found = seen.snapshot.errors, lab.correction
+    assert errors is not None and found is not None and found.found
+    # What perception needs is the depth camera; nobody says that it is not the colour camera.
+    truth = errors.T_believed_true @ errors.T_color_depth
+    assert np.linalg.norm(found.T_believed_true[:3, 3] - truth[:3, 3]) < 0.002
+    assert rotation_angle(found.T_believed_true[:3, :3], truth[:3, :3]) < np.deg2rad(0.1)
+    assert found.depth * errors.depth == pytest.approx(1.0, abs=0.002)
+    assert 10 < found.robot_seconds < 60
+    as_it_is, corrected = seen.as_it_is, seen.corrected
+    assert as_it_is.T_base_camera is not None and corrected.T_base_camera is not None
+    assert np.array_equal(corrected.T_base_camera, as_it_is.T_base_camera @ found.T_believed_true)
+    assert np.allclose(corrected.depth, as_it_is.depth * found.depth) and corrected.rgb is as_it_is.rgb
+
+
+def test_passes_looks_on_untouched_where_it_is_switched_off() -> None:
+    corrector = Corrector(Corrector.Config(calibrate=False))
+    given = frame(T_base_camera=np.eye(4))
+    assert list(corrector.on_look_request(LOOK, CTX)) == [LOOK]
+    assert list(corrector.on_frame(given, CTX)) == [given]
+    with pytest.raises(Refused, match=r"corrector\.calibrate is false"):
+        corrector.on_calibrate(Calibrate(), CTX)
+
+
+def test_a_camera_in_the_hand_is_taken_as_it_is_and_told_why() -> None:
+    corrector = Corrector(Corrector.Config(robot=HAND_CAMERA))
+    said, passed = corrector.on_look_request(LOOK, CTX)
+    assert isinstance(said, Correction) and not said.found and "in the hand" in said.reason
+    assert passed == LOOK
+    with pytest.raises(Refused, match="in the hand"):
+        corrector.on_calibrate(Calibrate(), CTX)
+
+
+def test_a_camera_of_which_nobody_knows_where_it_stands_is_taken_as_it_is() -> None:
+    corrector = Corrector(Corrector.Config())
+    (survey,) = corrector.on_look_request(LOOK, CTX)
+    assert survey == LookRequest(purpose="own arm: what is in the way")
+    said, passed = corrector.on_frame(frame(), CTX)
+    assert isinstance(said, Correction) and said.reason == "nobody knows where the camera stands to the robot"
+    assert passed == LOOK
+    (after,) = corrector.on_frame(frame(), CTX)
+    assert isinstance(after, Frame)
+    assert list(corrector.on_look_request(LOOK, CTX)) == [LOOK], "not again until it is asked for"
+    corrector.on_calibrate(Calibrate(), CTX)
+    assert list(corrector.on_look_request(LOOK, CTX)) == [survey]
+    with pytest.raises(Refused, match="under way: waits for a look at what is in the way"):
+        corrector.on_calibrate(Calibrate(), CTX)
+
+
+def arrived(*, success: bool = True, stopped: Stopped = "") -> Arrived:
+    return Arrived(
+        success=success, reason="", stopped=stopped, joint_names=(), positions=np.zeros(0), robot_seconds=2.0
+    )
+
+
+def under_way() -> Corrector:
+    """On the way to the first of two postures."""
+    corrector = Corrector(Corrector.Config())
+    ahead = tuple(
+        PostureRequest(joint_names=(), positions=np.zeros(0), table_height=0.0, occupied=np.zeros((0, 6)), label=label)
+        for label in ("second", "home")
+    )
+    corrector._state = State(phase=Phase.MOVING, asked=LOOK, ahead=ahead)  # pyright: ignore[reportPrivateUsage]
+    return corrector
+
+
+def test_a_posture_that_is_not_reached_is_left_out_and_too_few_say_nothing() -> None:
+    corrector = under_way()
+    (second,) = corrector.on_arrived(arrived(success=False), CTX)
+    assert isinstance(second, PostureRequest) and second.label == "second"
+    (home,) = corrector.on_arrived(arrived(success=False), CTX)
+    assert isinstance(home, PostureRequest) and home.label == "home"
+    said, passed = corrector.on_arrived(arrived(), CTX)
+    assert isinstance(said, Correction) and said.reason == "the arm could show itself in 0 postures only"
+    assert said.robot_seconds == 6.0 and passed == LOOK
+
+
+def test_after_a_touch_the_arm_goes_home() -> None:
+    (home,) = under_way().on_arrived(arrived(success=False, stopped="touch"), CTX)
+    assert isinstance(home, PostureRequest) and home.label == "home"
+
+
+def test_whoever_stops_the_arm_gets_no_look_and_the_next_one_begins_again() -> None:
+    corrector = under_way()
+    assert not list(corrector.on_arrived(arrived(success=False, stopped="stop"), CTX))
+    (survey,) = corrector.on_look_request(LOOK, CTX)
+    assert survey == LookRequest(purpose="own arm: what is in the way")
