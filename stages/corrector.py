@@ -102,6 +102,11 @@ class Corrector(Stage):
             """Standard deviations of rotation, translation and depth factor, 7."""
             return np.array([*[np.deg2rad(self.degrees)] * 3, *[self.translation] * 3, self.depth])
 
+    @classmethod
+    def prepare(cls, config: Config) -> None:
+        """Reads the robot's shapes and loads the kernel."""
+        cls(config)
+
     def __init__(self, config: Config) -> None:
         self._config = config
         self._robot = read_robot(config.robot)

@@ -22,7 +22,17 @@ def runner(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    command = (*RUNNER, "up", "graphs/interactive.yaml", "--set", "world.seed=1", "--recordings", str(tmp_path / "rec"))
+    command = (
+        *RUNNER,
+        "up",
+        "graphs/interactive.yaml",
+        "--set",
+        "world.seed=1",
+        "--set",
+        "corrector.calibrate=false",
+        "--recordings",
+        str(tmp_path / "rec"),
+    )
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         printed = read_until(process, "processes are ready")
         taught = runner("call", "demonstrator", "teach", "name=breakfast")

@@ -19,7 +19,13 @@ ROOT = Path(__file__).parents[1]
 def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    process = start_graph(ROOT / "graphs" / "interactive.yaml", "world.seed=1", folder=tmp_path, options=["--page"])
+    process = start_graph(
+        ROOT / "graphs" / "interactive.yaml",
+        "world.seed=1",
+        "corrector.calibrate=false",
+        folder=tmp_path,
+        options=["--page"],
+    )
     try:
         printed = read_until(process, "processes are ready")
         (url,) = re.findall(r"page: (\S+)", printed)

@@ -71,7 +71,7 @@ STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
 SHOWN_FAULTS = 4
 """Relations that do not hold, of a goal that was not reached."""
-Phase = Literal["look", "recognise", "teach", "restore", "check", "plan", "move"]
+Phase = Literal["look", "show", "recognise", "teach", "restore", "check", "plan", "move"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ class Story:
             case Teach() | Restore() | Look() as command:
                 self._ask(command, heard)
             case LookRequest(purpose=look) | Frame(name=look) if look.startswith(OWN_ARM):
-                pass
+                self._at("show")
             case LookRequest():
                 if not heard.id.startswith(f"{CORRECTOR}."):  # which passes on what was heard before
                     self._begin(heard)
@@ -389,7 +389,7 @@ class Story:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        moves = self._brakes and self._job is not None and self._job.phase == "move"
+        moves = self._brakes and self._job is not None and self._job.phase in ("move", "show")
         who = EXECUTOR if moves else DEMONSTRATOR
         yield Action(who, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
 

@@ -343,16 +343,16 @@ def test_a_command_may_be_recorded_before_or_after_what_it_causes(command_first:
     assert listener.doing == "Looks at what there is to do for “tea”"
 
 
-def test_looks_at_the_own_arm_are_told_as_the_look_that_waits_for_them() -> None:
-    listener = Listener()
-    listener.hear(Look())
-    look = LookRequest(purpose="look")
-    listener.story.hear(Heard(look, "demonstrator.look_request#0", ("stage.port#1",), 5))
-    before = listener.doing
-    shown = f"{OWN_ARM}, posture 1 of 4"
+def test_the_arm_that_shows_itself_may_be_stopped() -> None:
+    listener = Listener(brakes=True)
+    listener.called(Look())
+    shown, look = f"{OWN_ARM}, posture 1 of 4", LookRequest(purpose="look")
     listener.hear(LookRequest(purpose=shown), msgspec.structs.replace(frame(), name=shown))
+    assert listener.doing == "Shows its arm to the camera"
+    assert ("executor", "stop") in {(action.stage, action.command) for action in listener.told().actions}
     listener.story.hear(Heard(look, "corrector.look_request#1", ("demonstrator.look_request#0",), 6))
-    assert listener.doing == before
+    listener.hear(frame())
+    assert listener.doing == "Recognises what is there"
 
 
 def test_a_command_that_was_refused_changes_nothing() -> None:
