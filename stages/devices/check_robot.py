@@ -21,7 +21,6 @@ from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.planning.collision import CollisionWorld
 from stages.planning.motion import restarts, solve_ik
 from stages.robots import Robot, read_robot
-from stages.scene.catalogue import BUILT_IN, Catalogue
 
 _ABOVE = 0.05
 """Metres above the table at which fingertips are tried."""
@@ -34,7 +33,7 @@ _ASIDE = (1.6, -1.3, 1.0)
 
 def report(robot: Robot) -> Iterator[str]:
     """What the description comes to, line by line."""
-    world = _alone(robot)
+    world = CollisionWorld(robot, robot.table, {})
     rng = np.random.default_rng(0)
     close = world.contacts(robot.home)
     touching = Counter(pair for _ in range(_POSTURES) for pair in world.contacts(rng.uniform(world.lower, world.upper)))
@@ -63,11 +62,6 @@ def picture(robot: Robot) -> Rgb:
     images = [renderer.color(items, view, background=(214, 218, 222)) for view in views]
     renderer.close()
     return np.hstack(images)
-
-
-def _alone(robot: Robot) -> CollisionWorld:
-    away = pose(np.eye(3), np.array([-3.0, 0.0, 3.0]))
-    return CollisionWorld(robot, robot.table, {"cup": (Catalogue.load(BUILT_IN)["cup"], away)}, carried="cup")
 
 
 def _reaches(world: CollisionWorld, place: tuple[float, float]) -> bool:

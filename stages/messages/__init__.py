@@ -9,6 +9,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
 from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
+from stages.messages.hand_eye import Abort, CalibrateCamera, CameraCalibration, Mounting
 from stages.messages.robot import Brake, RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
@@ -37,6 +38,7 @@ from stages.messages.task import (
 )
 
 __all__ = [
+    "Abort",
     "Add",
     "Answer",
     "Arrange",
@@ -45,6 +47,8 @@ __all__ = [
     "Assertion",
     "Box",
     "Brake",
+    "CalibrateCamera",
+    "CameraCalibration",
     "Candidate",
     "Candidates",
     "Depth",
@@ -60,6 +64,7 @@ __all__ = [
     "LookRequest",
     "Loosen",
     "Mask",
+    "Mounting",
     "Move",
     "ObjectPose",
     "Observation",

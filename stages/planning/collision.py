@@ -41,7 +41,7 @@ def quaternion(R: Floats) -> Floats:
 
 
 class CollisionWorld:
-    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried.
+    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried, if any.
 
     The hand frame is the catalogue's grasp frame: x is the approach direction, y the closing direction, the origin
     lies between the fingertips. ``clearance`` (metres, at most :data:`AMPLE`) is kept from everything except what
@@ -54,7 +54,7 @@ class CollisionWorld:
         table: Table,
         objects: Mapping[str, tuple[CatalogueObject, Floats]],
         *,
-        carried: str,
+        carried: str = "",
         clearance: float = 0.005,
     ) -> None:
         self.robot, self.carried, self.checks = robot, carried, 0
@@ -184,7 +184,8 @@ class CollisionWorld:
         hand = spec.body(gripper.link).add_body(
             name="hand frame", pos=T_link_hand[:3, 3], quat=quaternion(T_link_hand[:3, :3])
         )
-        for geom in add_primitives(hand.add_body(name="held"), objects[self.carried][0].collision):
+        held = objects[self.carried][0].collision if self.carried else ()
+        for geom in add_primitives(hand.add_body(name="held"), held):
             geom.contype, geom.conaffinity, geom.mass = 0, 0, 1e-6
         return spec.compile()
 
