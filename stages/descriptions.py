@@ -8,13 +8,16 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import stages
 from runner.contract import Context, Finished, Stage
+from stages.geometry.arrays import Floats
 from stages.messages import CameraCalibration, Mounting
 from stages.robots import BUILT_IN, read_robot
 from stages.robots.writing import with_camera
 
+_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _PACKAGE = Path(stages.__file__).parent
 
 
@@ -48,6 +51,7 @@ class Descriptions(Stage):
         if found.success and found.T_link_camera is not None:
             ctx.log(found.reason)
             ctx.log(f"written to {self._write(found, ctx)}")
+            ctx.log(f"in ROS 2: static_transform_publisher {_transform(found.camera_link, found.T_link_camera)}")
             yield Mounting(link=found.camera_link, T_link_camera=found.T_link_camera)
         else:
             ctx.log(f"no calibration: {found.reason}", level="warning")
@@ -67,3 +71,10 @@ class Descriptions(Stage):
         target = self._file if own else ctx.directory / self._file.name
         with_camera(self._file, target, found.camera_link, found.T_link_camera, note)
         return target
+
+
+def _transform(link: str, T: Floats) -> str:
+    """What ROS 2 is told of the camera's optical frame."""
+    numbers = (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+    told = (f"--{key} {number:.6f}" for key, number in zip(_KEYS, numbers, strict=True))
+    return f"{' '.join(told)} --frame-id {link or 'BASE'} --child-frame-id CAMERA_OPTICAL_FRAME"

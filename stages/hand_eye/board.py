@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
 from stages.messages.arrays import Rgb
 
+_INCH, _DPI = 0.0254, 300
 _FEWEST = 8
 """Corners of a board that is seen: with fewer, or all in one row, its pose is anyone's guess."""
 
@@ -99,6 +103,29 @@ class Board:
         return (ids, np.asarray(found, np.float64).reshape(-1, 2)) if min(map(len, rows)) > 1 else None
 
 
+def picture(board: Board) -> Image.Image:
+    """The board with a white margin, to be printed without any scaling."""
+    pixels = round(board.square / _INCH * _DPI)
+    image = Image.fromarray(np.pad(board.print(pixels), pixels // 4, constant_values=255))
+    image.info["dpi"] = (pixels * _INCH / board.square,) * 2
+    return image
+
+
+def main() -> None:
+    """Reads the command line and writes the picture."""
+    parser = argparse.ArgumentParser(
+        description="Writes a board to be printed: python -m stages.hand_eye.board OUT.png"
+    )
+    parser.add_argument("out", type=Path, metavar="OUT.png")
+    for key in ("columns", "rows", "square", "marker", "dictionary"):
+        default = Board.__dataclass_fields__[key].default
+        parser.add_argument(f"--{key}", type=type(default), default=default)
+    options = vars(parser.parse_args())
+    out = options.pop("out")
+    image = picture(Board(**options))
+    image.save(out, dpi=image.info["dpi"])
+
+
 @cache
 def _printed(board: Board) -> Any:
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
@@ -108,3 +135,7 @@ def _printed(board: Board) -> Any:
 @cache
 def _detector(board: Board) -> Any:
     return cv2.aruco.CharucoDetector(_printed(board))
+
+
+if __name__ == "__main__":
+    main()
