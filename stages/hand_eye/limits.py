@@ -17,4 +17,5 @@ class Limits:
     """Pixels by which corners are off, root mean square."""
     millimetres: float = 2.0
     degrees: float = 0.2
-    """Uncertainty of the camera's position and turn."""
+    """By which the camera's place may be uncertain; a board may be as many millimetres, in the median, from where all
+    other pictures have it."""

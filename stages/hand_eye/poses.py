@@ -19,9 +19,11 @@ from stages.robots import Robot
 
 _ENOUGH = 5
 """So many times as many postures are found as are wanted: they are chosen from these."""
-_TRIES = 40
+_TRIES = 300
 """Places of the board in the picture that are tried for each posture that is wanted."""
-_MARGIN = 25
+_AIMS = 3
+"""Times that a place in the picture is aimed for."""
+_MARGIN = 60
 """Pixels between the pattern and the edge of the picture: nobody knows yet exactly where camera and board are."""
 _SMALLEST = 18.0
 """Pixels of a square's edge."""
@@ -103,22 +105,36 @@ def _in_view(
     rig: Rig, world: CollisionWorld, sightlines: Sightlines, tries: int, rng: np.random.Generator
 ) -> Iterator[Floats]:
     """Postures that are free and in which the whole pattern is in the picture."""
-    robot, last = rig.robot, rig.robot.home
-    good: list[Floats] = []
-    """Places in the picture that could be reached: others are looked for near them, too."""
+    good: list[tuple[Floats, Floats]] = []
+    """Places in the picture that could be reached, and how: others are looked for near them, too."""
     for _ in range(tries):
-        wanted = _near(good[rng.integers(len(good))], rng) if good and rng.random() < _NEAR else _drawn(rig, rng)
-        target = _hand(rig, world, last, wanted)
-        q = solve_ik(world, target, seeds=restarts(world, rng, last, robot.home, extra=1))
+        if good and rng.random() < _NEAR:
+            place, start = good[rng.integers(len(good))]
+            seeds, wanted = iter([start]), _near(place, rng)
+        else:
+            start, wanted = rig.robot.home, _drawn(rig, rng)
+            seeds = restarts(world, rng, start, extra=2)
+        q = _reached(rig, world, wanted, start, seeds) if _sees(rig, wanted) else None
         if q is None:
             continue
-        T = _T_camera_board(rig, q)
-        T_base_camera = _T_base_camera(rig, q)
+        T, T_base_camera = _T_camera_board(rig, q), _T_base_camera(rig, q)
         points = (T_base_camera @ T @ np.vstack([rig.board.rim.T, np.ones(4)]))[:3].T
-        if _sees(rig, T) and sightlines.reach(q, T_base_camera[:3, 3], points):
-            last = q
-            good.append(T)
+        if sightlines.reach(q, T_base_camera[:3, 3], points):
+            good.append((T, q))
             yield q
+
+
+def _reached(rig: Rig, world: CollisionWorld, wanted: Floats, start: Floats, seeds: Iterator[Floats]) -> Floats | None:
+    """A posture that shows the board about at ``wanted`` (T_camera_board); None where none is found.
+
+    The arm's first joint may carry the camera as well (a torso that lifts): then it is aimed for again.
+    """
+    for _ in range(_AIMS):
+        q = solve_ik(world, _hand(rig, world, start, wanted), seeds=seeds)
+        if q is None or _sees(rig, _T_camera_board(rig, q)):
+            return q
+        start, seeds = q, iter([q])
+    return None
 
 
 def _near(T: Floats, rng: np.random.Generator) -> Floats:

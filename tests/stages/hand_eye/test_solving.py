@@ -8,10 +8,14 @@ import pytest
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose, rotation_angle
+from stages.hand_eye.board import Board
 from stages.hand_eye.limits import Limits
-from stages.hand_eye.routine import too_alike
+from stages.hand_eye.rig import Rig
+from stages.hand_eye.routine import judged, too_alike
 from stages.hand_eye.solving import Fit, left_out, solve, turns
+from stages.robots import read_robot
 from tests.stages.hand_eye.sights import X, Y, sights
+from tests.stages.robots.test_robots import FOLDER
 
 
 def errors(fit: Fit) -> tuple[float, float]:
@@ -87,3 +91,14 @@ def test_poses_that_are_too_alike_are_refused_with_what_is_missing(
 def test_poses_that_differ_are_not_refused() -> None:
     assert too_alike(sights(8, 0), Limits(), "hand") == ""
     assert np.rad2deg(turns(sights(8, 0))[0][1]) > Limits().turn
+
+
+def test_pictures_that_contradict_each_other_are_no_calibration() -> None:
+    rig = Rig(read_robot(FOLDER / "ur5e_hand.yaml"), Board())
+    for square, said in (
+        (1.0, "12 boards, residual 0.2"),
+        (1.03, "the pictures contradict each other, by more than 1 px or 2 mm"),
+    ):
+        pictures = sights(12, 0, square=square)
+        found = judged(rig, pictures, solve(pictures), Limits())
+        assert found.success == (square == 1.0) and found.reason.startswith(said)
