@@ -146,11 +146,12 @@ def judged(rig: Rig, sights: Sequence[Sight], fit: Fit, limits: Limits) -> Camer
 def _fault(rig: Rig, fit: Fit, out: Floats, limits: Limits) -> str:
     most = np.array([1e-3 * limits.millimetres, np.deg2rad(limits.degrees)])
     told = f"{limits.millimetres:g} mm or {limits.degrees:g} degrees"
-    # By how much boards are turned corners alone leave open, too: their distances tell more.
+    # Corners leave open how a board is turned, too; where it is they tell well.
     if fit.residual > limits.residual or np.median(out[:, 0]) > most[0]:
         return (
-            f"the pictures contradict each other, by more than {limits.residual:g} px or {limits.millimetres:g} mm: are "
-            f"the squares {1e3 * rig.board.square:g} mm, does the board sit tight, is the lens known, are the encoders right?"
+            f"the pictures contradict each other, by more than {limits.residual:g} px or {limits.millimetres:g} mm: "
+            f"are the squares {1e3 * rig.board.square:g} mm, does the board sit tight, is the lens known, are the "
+            "encoders right?"
         )
     if (np.array(fit.uncertain) > most).any():
         return (
