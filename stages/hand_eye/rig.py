@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -100,8 +99,7 @@ def _plate(board: Board, Y: Floats, held: bool, clearance: float) -> str:
     boxes = [((0.0, 0.0), (width, height))]
     if held:
         boxes.append(((0.0, -height - _HANDLE / 2), (0.02, _HANDLE / 2)))
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(Y[:3, :3]).ravel())
+    quaternion = Rotation.from_matrix(Y[:3, :3]).as_quat(scalar_first=True)
     geoms = "".join(
         f'<geom type="box" pos="{x} {y} {_THICK / 2 + _BEHIND}" rgba="0.95 0.95 0.95 1" mass="0.1" '
         f'size="{w + clearance} {h + clearance} {_THICK / 2 + clearance}"/>'
