@@ -13,7 +13,9 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.devices.ros2.settings import Distribution, Link, Patience, Source
 from stages.geometry.arrays import Floats
+from stages.geometry.lens import INVERSE, PLUMB_BOB, Lens
 from stages.geometry.poses import is_pose
+from stages.hand_eye.board import Board
 from stages.messages import Frame, LookRequest, Snapshot
 from stages.perception.rendering.depth_noise import color_noise, structured_light
 from stages.robots import BUILT_IN, read_robot
@@ -33,6 +35,12 @@ class SimulatedCamera(Stage):
         catalogue: Path
         robot: Path = BUILT_IN
         noise: bool = True
+        lens: tuple[float, ...] = ()
+        """k1 k2 p1 p2 k3 of a lens that bends the image ..."""
+        straighten: bool = True
+        """... which is straightened again, as a real camera's is whose lens somebody has measured."""
+        board: Board | None = None
+        """How the board looks that the world may have."""
 
     def __init__(self, config: Config) -> None:
         # OpenGL is for this camera only.
@@ -41,7 +49,10 @@ class SimulatedCamera(Stage):
         self._noise = config.noise
         self._robot = read_robot(config.robot)
         self._K = self._robot.camera.K
-        self._camera = SimulatedCamera(Catalogue.shared(config.catalogue), self._robot)
+        width, height = self._robot.camera.size
+        self._bend = Lens(self._K, (height, width), config.lens, INVERSE)
+        self._lens = Lens(self._K, (height, width), config.lens if config.straighten else (), PLUMB_BOB)
+        self._camera = SimulatedCamera(Catalogue.shared(config.catalogue), self._robot, config.board)
         self._looks = 0
 
     @classmethod
@@ -55,9 +66,10 @@ class SimulatedCamera(Stage):
         """The image, which is said to be from where the encoders have the camera."""
         T_base_camera = self._robot.camera_pose(snapshot.joint_names, snapshot.joint_positions)
         shown = snapshot if self._noise else msgspec.structs.replace(snapshot, errors=None)
-        rgb, depth = self._camera.image(shown, T_base_camera)
+        rgb, depth = self._bend.straighten(*self._camera.image(shown, T_base_camera))
         if self._noise:
             rgb, depth = color_noise(rgb, ctx.rng), structured_light(depth, self._K, ctx.rng)
+        rgb, depth = self._lens.straighten(rgb, depth)
         self._looks += 1
         return Frame(
             rgb=rgb,

@@ -42,6 +42,7 @@ from stages.geometry.camera import back_project
 from stages.messages import (
     Arrange,
     Arrangement,
+    CameraCalibration,
     Candidates,
     Frame,
     Goal,
@@ -514,6 +515,8 @@ def progress_line(message: Message) -> str:
             line = f"transfer {number}: {transfer.object} to {transfer.destination}"
         case Outcome(number=number, success=success, failed_stage=stage, reason=reason):
             line = f"transfer {number} " + ("done" if success else f"failed at {stage}: {reason}")
+        case CameraCalibration(success=success, reason=reason):
+            line = f"**{'calibrated' if success else 'not calibrated'}**: {reason}"
         case Verdict(success=success, reason=reason):
             line = f"**{'restored' if success else 'not restored'}**: {reason}"
         case _:

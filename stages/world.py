@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
 
-from runner.contract import Context, Refused, Stage
-from stages.devices.miscalibration import Miscalibration
-from stages.devices.servo import PIECE
-from stages.devices.simulation import Simulation
+from runner.contract import Context, Refused
+from stages.devices.board import Bare, TrueBoard
+from stages.devices.simulated_robot import SimulatedRobot
 from stages.devices.suites import kinds
 from stages.devices.suites.placing import moved
 from stages.devices.suites.suite import Kind, Rejected
 from stages.devices.tabletop import Layout
-from stages.geometry.arrays import Floats
-from stages.geometry.poses import pose
-from stages.messages import Arrange, Arrangement, Brake, LookRequest, Move, RobotCommand, RobotState, Snapshot
+from stages.hand_eye.board import Board
+from stages.messages import Arrange, Arrangement, LookRequest, Move, RobotState, Snapshot
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -30,14 +27,10 @@ _DRIFT = 0.01
 _TILT = 0.995
 """Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
 _DRAWS = 200
-_LOOK = 4.0
-"""Seconds that pass for others while the robot looks and thinks."""
 
 
-class World(Stage):
+class World(SimulatedRobot):
     """A table, a tray, objects and a robot in MuJoCo; a person lays out scenes between the robot's tasks."""
-
-    device = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
@@ -56,18 +49,10 @@ class World(Stage):
             kinds.check(self.suite, self.goal, self.seed)
 
     def __init__(self, config: Config) -> None:
-        self._config = config
-        self._catalogue = Catalogue.shared(config.catalogue)
-        self._robot = read_robot(config.robot)
-        self._suite = kinds.suite(config.suite, self._catalogue, self._robot, config.seed, goal=config.goal)
-        self._looks = 0
-        rng = np.random.default_rng([config.seed, 4])
-        self._wrong = Miscalibration.draw(rng, self._robot, joints=self._suite.joints)
-        self._simulation = Simulation(
-            self._catalogue, self._robot, self._suite.names, self._suite.table, factors=self._suite.factors
-        )
-        self._started = False
-        """Somebody may meddle: the start scene is laid out."""
+        self._config, self._catalogue = config, Catalogue.shared(config.catalogue)
+        robot = read_robot(config.robot)
+        suite = kinds.suite(config.suite, self._catalogue, robot, config.seed, goal=config.goal)
+        super().__init__(robot, suite, self._catalogue, config.seed)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""
@@ -89,51 +74,6 @@ class World(Stage):
             move.name, moved(move.name, (move.x, move.y), layout, self._catalogue, self._suite.table)
         )
         ctx.log(f"{move.name} moved to {move.x:.2f}, {move.y:.2f}")
-
-    def on_look_request(self, look_request: LookRequest, ctx: Context) -> Snapshot:
-        """The world as it is now, for the simulated camera."""
-        self._meddle(_LOOK, ctx)
-        table = self._suite.table
-        rng = np.random.default_rng([self._config.seed, 3, self._looks])
-        self._looks += 1
-        return Snapshot(
-            names=self._simulation.present,
-            T_base_objects=self._simulation.object_poses(),
-            joint_names=self._robot.joint_names,
-            joint_positions=self._encoders(),
-            time=self._simulation.time,
-            purpose=look_request.purpose,
-            T_base_table=pose(np.eye(3), np.array([*table.center, table.height])),
-            table_size=np.array(table.size),
-            errors=self._wrong.at_a_look(rng),
-        )
-
-    def on_robot_command(self, robot_command: RobotCommand, ctx: Context) -> Iterator[RobotState | None]:
-        """Runs a joint trajectory, then moves the gripper; an empty command only reads the encoders.
-
-        What else arrives is heard in between, so that somebody may meddle or stop the arm.
-        """
-        servo = self._simulation.servo
-        joints = [self._robot.joint_names.index(name) for name in robot_command.joint_names]
-        if joints:
-            positions = robot_command.positions + self._wrong.joints[joints]
-            robot_command = structs.replace(robot_command, positions=positions)
-        try:
-            for _ in servo.carry_out(robot_command):
-                self._meddle(PIECE, ctx)
-                yield None
-        except GeneratorExit:
-            ctx.log(f"the arm stands; the fingers are {1e3 * servo.opening():.0f} mm apart")
-            raise
-        yield self._state()
-
-    def on_brake(self, brake: Brake) -> None:
-        """Stops the arm where it is."""
-        self._simulation.servo.brake()
-
-    def _meddle(self, seconds: float, ctx: Context) -> None:
-        if self._started and (what := self._suite.meddle(self._simulation, seconds)):
-            ctx.log(what)
 
     def _lay_out(self, kind: Kind, draw: tuple[int, ...], ctx: Context) -> None:
         """Draws scenes until one is possible and stands, and says how many were not, and why."""
@@ -162,18 +102,27 @@ class World(Stage):
             for name, T in layout.items()
         )
 
-    def _encoders(self) -> Floats:
-        return self._simulation.encoders() - self._wrong.joints
 
-    def _state(self) -> RobotState:
-        servo = self._simulation.servo
-        return RobotState(
-            joint_names=self._robot.joint_names,
-            positions=self._encoders(),
-            gripper_width=servo.opening(),
-            time=self._simulation.time,
-            tracking_error=servo.error,
-            stopped=servo.stopped,
-            reason=servo.reason,
-            force=servo.force,
-        )
+class BoardWorld(SimulatedRobot):
+    """A table with nothing on it, a robot, and a board to calibrate its camera with."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Config:
+        """``seed`` draws how far the camera and the board are from where they are said to be."""
+
+        robot: Path = ROBOT
+        board: Board = field(default_factory=Board)
+        encoders: float = 0.0
+        """Degrees by which the encoders are off at most."""
+        seed: int = 0
+
+    def __init__(self, config: Config) -> None:
+        robot = read_robot(config.robot)
+        self._board = TrueBoard(robot, config.board, np.random.default_rng([config.seed, 5]))
+        suite = Bare(robot.table, joints=np.deg2rad(config.encoders))
+        super().__init__(self._board.robot, suite, Catalogue({}), config.seed)
+
+    def on_look_request(self, look_request: LookRequest, ctx: Context) -> Snapshot:
+        """The robot and the board as they are now."""
+        T_base_board = self._board.place(self._simulation.encoders())
+        return structs.replace(super().on_look_request(look_request, ctx), T_base_board=T_base_board)

@@ -29,6 +29,7 @@ GRAPHS = {
     "tray": (),
     "interactive": (),
     "ur5e": (),
+    "calibrate": (),
     "bag": ("--set", "camera.bag=d"),
     "ros2": (),
     "reference": (),

@@ -3,7 +3,7 @@
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from runner.cli.commands import Command, graphs, keys, live, machine, new, recordings, replay
 from runner.cli.completion import complete_and_exit
@@ -15,12 +15,13 @@ EXIT_INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status; what is refused is one line on stderr."""
-    built = parser()
+    built, names = parser()
     complete_and_exit(built)
     sys.path.insert(0, os.getcwd())  # noqa: PTH109 - as `python -m` does: stages beside the graph can be named
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        options = built.parse_args(arguments)
-        options.arguments = list(sys.argv[1:] if arguments is None else arguments)
+        options = built.parse_args(["up", *given] if _names_a_graph(given, names) else given)
+        options.arguments = given
         command: Command = options.command
         return command(options) or 0
     except Refused as refusal:
@@ -32,10 +33,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
 
 
-def parser() -> argparse.ArgumentParser:
-    """All commands and their options."""
+def _names_a_graph(given: Sequence[str], commands: Collection[str]) -> bool:
+    """Whether it begins with a graph that a package brings: ``runner NAME`` is ``runner up NAME``."""
+    if not given or given[0] in commands or given[0].startswith("-"):
+        return False
+    from runner.graph.packaged import packaged_graphs
+
+    return given[0] in packaged_graphs()
+
+
+def parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
+    """All commands with their options, and their names."""
     parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (new, graphs, live, recordings, replay, keys, machine):
         group.add_commands(commands)
-    return parser
+    return parser, commands.choices

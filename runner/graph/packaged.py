@@ -37,10 +37,15 @@ def find_graph(path: Path) -> Path:
     """
     if path.suffix or len(path.parts) != 1 or (path.exists() and not path.is_dir()):
         return locate(path, Path())
-    graphs = {file.stem: file for folder in _graph_folders() for file in folder.glob("*.yaml")}
+    graphs = packaged_graphs()
     if path.name not in graphs:
         raise Refused(f"{path}: no such file, and no graph of an installed package{suggest(path.name, graphs)}")
     return graphs[path.name]
+
+
+def packaged_graphs() -> dict[str, Path]:
+    """The graphs of all installed packages, by name."""
+    return {file.stem: file for folder in _graph_folders() for file in folder.glob("*.yaml")}
 
 
 def _graph_folders() -> Iterator[Path]:

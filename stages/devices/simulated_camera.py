@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.devices.board import print_of
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
+from stages.hand_eye.board import Board
 from stages.messages import Snapshot
 from stages.messages.arrays import Depth, Mask, Rgb
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
@@ -36,8 +38,10 @@ _SKY = (214, 218, 222)
 class SimulatedCamera:
     """Renders snapshots of the simulated world. One per process: it owns an OpenGL context."""
 
-    def __init__(self, catalogue: Catalogue, robot: Robot) -> None:
+    def __init__(self, catalogue: Catalogue, robot: Robot, board: Board | None = None) -> None:
+        """``board``: how the one looks that a snapshot may have."""
         self._catalogue, self._robot, self._K = catalogue, robot, robot.camera.K
+        self._board = board
         self._renderer = Renderer(*robot.camera.size)
 
     def image(self, snapshot: Snapshot, T_base_camera: Floats) -> tuple[Rgb, Depth]:
@@ -86,7 +90,13 @@ class SimulatedCamera:
         poses = zip(snapshot.names, snapshot.T_base_objects, strict=True)
         objects = (Item(self._catalogue[label_of(name, self._catalogue)].mesh, T) for name, T in poses)
         table = _table(snapshot) or self._robot.table
-        return [*room(table, self._robot.floor), *objects, *self._links(snapshot.joint_names, joint_positions)]
+        links = self._links(snapshot.joint_names, joint_positions)
+        return [*room(table, self._robot.floor), *objects, *links, *self._shown_board(snapshot)]
+
+    def _shown_board(self, snapshot: Snapshot) -> list[Item]:
+        if self._board is None or snapshot.T_base_board is None:
+            return []
+        return [Item(print_of(self._board), snapshot.T_base_board)]
 
     def _links(self, joint_names: Sequence[str], positions: Floats) -> list[Item]:
         return [Item(mesh, T) for mesh, T in self._robot.links(joint_names, positions)]

@@ -67,6 +67,7 @@ class Simulation:
         self._joints = np.array([self._model.joint(name).qposadr[0] for name in robot.joint_names])
         self._pads = [self._model.geom(name).id for name in robot.model.pads]
         self._rough = self._model.geom_friction[self._pads].copy()
+        self._go_home()
 
     @property
     def time(self) -> float:
@@ -156,7 +157,7 @@ class Simulation:
     def object_poses(self) -> Floats:
         """N x 4 x 4: T_base_object of every object that is ``present``, in that order."""
         bodies = [self._data.body(name) for name in self.present]
-        return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies])
+        return np.array([pose(body.xmat.reshape(3, 3), body.xpos) for body in bodies]).reshape(-1, 4, 4)
 
     def _go_home(self) -> None:
         gripper = self._robot.gripper

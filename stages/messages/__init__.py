@@ -10,6 +10,7 @@ from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, P
 from stages.messages.correction import Arrived, Calibrate, Correction, PostureRequest
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
 from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
+from stages.messages.hand_eye import Abort, CalibrateCamera, CameraCalibration, Mounting
 from stages.messages.robot import Brake, RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
@@ -38,6 +39,7 @@ from stages.messages.task import (
 )
 
 __all__ = [
+    "Abort",
     "Add",
     "Answer",
     "Arrange",
@@ -48,6 +50,8 @@ __all__ = [
     "Box",
     "Brake",
     "Calibrate",
+    "CalibrateCamera",
+    "CameraCalibration",
     "Candidate",
     "Candidates",
     "Correction",
@@ -64,6 +68,7 @@ __all__ = [
     "LookRequest",
     "Loosen",
     "Mask",
+    "Mounting",
     "Move",
     "ObjectPose",
     "Observation",

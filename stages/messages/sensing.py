@@ -48,6 +48,8 @@ class Snapshot(Message, frozen=True, kw_only=True):
     table_size: Vector | None = None
     """Its extent along x and y, metres; None in recordings that are older."""
     errors: SensorErrors | None = None
+    T_base_board: Pose | None = None
+    """The middle of a board to calibrate the camera with, where there is one."""
 
 
 class Frame(Message, frozen=True, kw_only=True):

@@ -66,11 +66,13 @@ def assembled(model: Model) -> mujoco.MjSpec:
         if not part.on:
             spec.attach(other, prefix=part.prefix, frame=spec.worldbody.add_frame())
             continue
-        site = spec.site(part.on)
-        if site is None:
-            sites = ", ".join(site.name for site in spec.sites)
-            raise Refused(f"{part.file}: no site '{part.on}' to mount it on; valid: {sites}")
-        spec.attach(other, prefix=part.prefix, site=site)
+        if (site := spec.site(part.on)) is not None:
+            spec.attach(other, prefix=part.prefix, site=site)
+        elif (link := spec.body(part.on)) is not None:
+            spec.attach(other, prefix=part.prefix, frame=link.add_frame())
+        else:
+            valid = ", ".join(place.name for place in (*spec.sites, *spec.bodies))
+            raise Refused(f"{part.file}: no site and no link '{part.on}' to mount it on; valid: {valid}")
     for name in model.removed:
         element = spec.body(name) or spec.joint(name)
         if element is None:

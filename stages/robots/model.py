@@ -19,7 +19,7 @@ class Part:
     without: str = ""
     """Left out of all names."""
     on: str = ""
-    """Site of an earlier part that this one is mounted on; empty where it stands in the base frame."""
+    """Site or link of an earlier part that this one is mounted on; empty where it stands in the base frame."""
     prefix: str = ""
     """Put before all names of this part."""
     packages: Path = Path()

@@ -184,7 +184,7 @@ def _fingers(gripper: Section) -> tuple[str, str]:
 
 
 def _camera(section: Section) -> Camera:
-    section.only("link", "position", "rotation", "focal", "size")
+    section.only("link", "position", "rotation", "focal", "size", "calibrated")
     link, mounted = section.text("link", ""), {"position", "rotation"} & set(section.values)
     width, height = section.numbers("size", 2).astype(int).tolist()
     return Camera(
@@ -192,6 +192,7 @@ def _camera(section: Section) -> Camera:
         T_link_camera=_mounting(section) if mounted or not link else None,
         focal=section.number("focal", low=0),
         size=(width, height),
+        calibrated=section.text("calibrated", ""),
     )
 
 

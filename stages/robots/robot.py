@@ -87,6 +87,8 @@ class Camera:
     """Pixels."""
     size: tuple[int, int]
     """Width and height, pixels."""
+    calibrated: str = ""
+    """When it was measured where the camera is, and how well; empty: nobody has."""
 
     @property
     def K(self) -> Floats:

@@ -13,6 +13,7 @@ from runner.graph.graph import graph_from_json, graph_to_json, load_graph, node_
 from runner.graph.packaged import find_graph, locate, portable_name
 from runner.hosts.head import moved
 from runner.recording.provenance import file_hashes, portable
+from runner.testing import finish, runner
 
 STAGES = """
 from dataclasses import dataclass
@@ -118,3 +119,7 @@ def test_an_extra_that_is_missing_is_named(package: Path):
     (package.parent / "brought-1.dist-info/top_level.txt").write_text("brought\n")
     with pytest.raises(Refused, match=r"No module named 'not_there'; type: pip install 'brought\[brought\]'"):
         load_graph(find_graph(Path("told")))
+
+
+def test_a_graph_runs_by_its_name_alone(package: Path, tmp_path: Path):
+    assert "run told-" in finish(runner("told", "--recordings", str(tmp_path)), tmp_path).output
