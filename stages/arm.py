@@ -37,8 +37,9 @@ class Ros2Arm(Stage):
         care: Care = field(default_factory=Care)
         armed: bool = False
         """The operator's word that the robot may move: its workspace is free and somebody stands at the stop button."""
-        calibrated: bool = False
-        """The operator's word that the transforms say where the camera is, by a calibration."""
+        calibrated: bool | None = False
+        """The operator's word that the transforms say where the camera is, by a calibration. None where motions do not
+        depend on it, as those that calibrate it."""
 
     def __init__(self, config: Config) -> None:
         from stages.devices.ros2.acting.arm import RemoteArm
@@ -70,7 +71,7 @@ class Ros2Arm(Stage):
     def _withheld(self) -> str:
         """Why nothing may move; empty where it may."""
         config = self._config
-        lacking = [name for name in ("armed", "calibrated") if not getattr(config, name)]
+        lacking = [name for name in ("armed", "calibrated") if getattr(config, name) is False]
         return f"nothing moves, only shown: set arm.{'=true and arm.'.join(lacking)}=true" if lacking else ""
 
     def _show(self, command: RobotCommand, why: str) -> Iterator[Said]:

@@ -38,11 +38,6 @@ ROOT = Path(__file__).parents[2]
 GOAL = "breakfast"
 _SECONDS = {"ready": 600.0, "teach": 600.0, "restore": 7200.0}
 """How long the graph may take to start, and to teach and restore; where processors are busy, all of it takes longer."""
-PATIENT = (
-    "arm.care.stale=3", "arm.care.max_age=5", "arm.care.answer=15", "arm.care.stuck=30",
-    "camera.patience.max_age=10", "camera.patience.warn=30", "camera.patience.give_up=600",
-)  # fmt: skip
-"""Lab and robot share processors here, and neither gets them when it wants: what would be a fault elsewhere is none."""
 Layouts = list[dict[str, Any]]
 
 

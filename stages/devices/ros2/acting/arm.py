@@ -26,7 +26,7 @@ DISPLAY = "moveit_msgs/msg/DisplayTrajectory"
 _PIECE = 0.05
 """Seconds after which others have their turn."""
 _SETTLE, _STILL = 0.25, 5e-4
-"""For so long an arm has stood that moved by less, seconds, radians (metres)."""
+"""For so long an arm has stood that moved by less, seconds, radians (metres). Fingers creep on what they hold."""
 _BESIDE = 0.1
 """Radians (metres) from where a motion begins within which an arm must be: it has not been moved since it was read."""
 _CODES = {
@@ -263,20 +263,19 @@ class RemoteArm:
         return ""
 
     def _rest(self) -> Iterator[None]:
-        """Waits until the arm and the fingers stand."""
-        names = [*self._names, self._finger]
+        """Waits until the arm stands."""
         seen: deque[tuple[float, Floats]] = deque()
         until = time.monotonic() + self._care.stuck
         while not seen or seen[-1][0] - seen[0][0] < _SETTLE:
             self._listen()
             if why := self._joints.trouble():
                 raise _Broken("fault", why)
-            now, q = time.monotonic(), self._joints.positions(names)
+            now, q = time.monotonic(), self.posture()
             while seen and np.abs(seen[0][1] - q).max() > _STILL:
                 seen.popleft()
             seen.append((now, q))
             if now > until:
-                raise _Broken("fault", f"it does not come to rest within {self._care.stuck:g} s")
+                raise _Broken("fault", f"the arm does not come to rest within {self._care.stuck:g} s")
             yield
 
     def _listen(self) -> list[Any]:

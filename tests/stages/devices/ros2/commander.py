@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from runner.contract import Finished, Stage
-from stages.messages import RobotCommand, RobotState
+from stages.messages import Brake, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.robots import read_robot
 from tests.stages.devices.ros2.robot import ROBOT
@@ -24,8 +24,8 @@ class Commander(Stage):
         """The first turn."""
         return _turn(read_robot(ROBOT).home)
 
-    def on_robot_state(self, robot_state: RobotState) -> RobotCommand | Finished:
-        """The next one; the end where the robot did not do it."""
+    def on_robot_state(self, robot_state: RobotState) -> RobotCommand | Brake | Finished:
+        """The next one; the end where the robot did not do it. Nobody brakes."""
         if robot_state.stopped:
             return Finished(code=0, reason=f"{robot_state.stopped}: {robot_state.reason}")
         return _turn(robot_state.positions[:6])
