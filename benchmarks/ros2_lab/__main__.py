@@ -89,8 +89,9 @@ class Referee:
         """What the lab answers."""
         reader, writer = self._lab.stdout, self._lab.stdin
         assert reader is not None and writer is not None
-        writer.write(f"{line}\n")
-        writer.flush()
+        with contextlib.suppress(BrokenPipeError):
+            writer.write(f"{line}\n")
+            writer.flush()
         answer = reader.readline()
         if not answer:
             raise SystemExit(f"the lab ended with exit status {self._lab.wait()}")
@@ -98,9 +99,7 @@ class Referee:
 
     def close(self) -> None:
         """Ends the lab."""
-        assert self._lab.stdin is not None
-        self._lab.stdin.close()
-        self._lab.wait()
+        self._lab.communicate()
 
 
 def run(seed: int, folder: Path, settings: Sequence[str]) -> tuple[Episode, dict[str, Any]]:
@@ -187,7 +186,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(HEADER)
     episodes: list[Episode] = []
     for seed in options.seeds:
-        episode, health = run(seed, options.folder, options.settings)
+        options.folder.mkdir(exist_ok=True)
+        own = Path(tempfile.mkdtemp(prefix=f"ros2-lab-{seed}-", dir=options.folder))
+        episode, health = run(seed, own, options.settings)
         episodes.append(episode)
         print(row(episode), flush=True)
         print(f"seed {seed}: {health}", file=sys.stderr)

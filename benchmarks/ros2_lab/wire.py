@@ -129,13 +129,18 @@ class Speaker:
         self._kept: list[Any] = [self._token(f"0/NN/%/%/{name}")]
 
     def publisher(
-        self, topic: str, type: str, *, latched: bool = False, reliable: bool = True
+        self, topic: str, type: str, *, latched: bool = False, reliable: bool = True, waits: bool = False
     ) -> Callable[[Any], None]:
-        """What publishes a message of a topic."""
+        """What publishes a message of a topic; as rmw_zenoh does it leaves out what the network does not take at once,
+        unless it ``waits``.
+        """
         qos = f"{'' if reliable else 2}:{1 if latched else ''}:,{1 if latched else 10}:,:,:,,"
         gid = self._announce("MP", topic, type, qos)
-        late: dict[str, Any] = {"cache": ext.CacheConfig(max_samples=1), "publisher_detection": True} if latched else {}
-        publisher = ext.declare_advanced_publisher(self._session, self._key(topic, type), **late)
+        late: dict[str, Any] = {"cache": ext.CacheConfig(max_samples=1), "publisher_detection": True}
+        control = zenoh.CongestionControl.BLOCK if waits else zenoh.CongestionControl.DROP
+        publisher = ext.declare_advanced_publisher(
+            self._session, self._key(topic, type), congestion_control=control, **(late if latched else {})
+        )
         self._kept.append(publisher)
         count = itertools.count(1)
 
