@@ -11,10 +11,11 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import cv2
+import mujoco
 import numpy as np
 
 from benchmarks.ros2_lab.bench import ROBOT
-from benchmarks.ros2_lab.wire import Interfaces, Speaker, stamp
+from benchmarks.ros2_lab.wire import Interfaces, Speaker, stamp, transform
 from stages.devices.simulated_camera import room
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose
@@ -62,8 +63,10 @@ def serve(seed: int, endpoint: str, pipe: Connection) -> None:
     color, depth = (node.publisher(topic, "sensor_msgs/msg/Image", reliable=False) for topic in topics)
     info = node.publisher("/camera/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", reliable=False)
     fixed = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", latched=True)
-    assert robot.camera.T_link_camera is not None
-    fixed(_transform(node.new, robot.camera.T_link_camera))
+    T_said, turn = robot.camera.T_link_camera, np.zeros(4)
+    assert T_said is not None
+    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(T_said[:3, :3]).ravel())
+    fixed(transform(node.new, "base_link", FRAME, T_said[:3, 3], turn))
     eye, shown, due = Eye(seed), -1, time.monotonic()
     while True:
         pipe.send("picture")
@@ -138,17 +141,6 @@ def _info(new: Interfaces, header: Any, K: Floats, size: tuple[int, int]) -> Any
         distortion_model="plumb_bob",
         **given,
     )
-
-
-def _transform(new: Interfaces, T: Floats) -> Any:
-    w = np.sqrt(max(1 + np.trace(T[:3, :3]), 0)) / 2
-    # A camera that looks down at a table is turned by less than half a turn: w is not small there.
-    x, y, z = np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]]) / (4 * w)
-    translation = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
-    place = {"translation": translation, "rotation": {"x": x, "y": y, "z": z, "w": w}}
-    header = {"stamp": stamp(time.time_ns()), "frame_id": "base_link"}
-    one = new("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=FRAME, transform=place)
-    return new("tf2_msgs/msg/TFMessage", transforms=[one])
 
 
 def _unit(rng: np.random.Generator) -> Floats:

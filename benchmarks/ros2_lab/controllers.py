@@ -10,15 +10,15 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from benchmarks.ros2_lab.bench import Bench
-from benchmarks.ros2_lab.wire import Server, Speaker, stamp
+from benchmarks.ros2_lab.wire import Server, Speaker, stamp, transform
 
 FOLLOW, GRIP = "control_msgs/action/FollowJointTrajectory", "control_msgs/action/GripperCommand"
 ARM, GRIPPER = "/scaled_joint_trajectory_controller/follow_joint_trajectory", "/robotiq_gripper_controller/gripper_cmd"
 FINGER = "robotiq_85_left_knuckle_joint"
 _SUCCEEDED, _CANCELED, _ABORTED = 4, 5, 6
 _PATH, _GOAL = -4, -5
-_STATES_STEPS, _FEEDBACK_STEPS = 4, 25
-"""Steps of 2 ms: 125 and 20 Hz."""
+_STATES_STEPS, _TOOL_STEPS, _FEEDBACK_STEPS = 4, 16, 25
+"""Steps of 2 ms: 125, 31 and 20 Hz."""
 _BRAKE, _RAMP, _STALL = 0.1, 0.6, 0.15
 _POSITION_NOISE, _EFFORT_NOISE = 1e-5, 0.1
 """Radians, newton metres."""
@@ -48,6 +48,7 @@ class Arm:
         self._overloaded = self._steps = 0
         self.protective = ""
         self._states = node.publisher("/joint_states", "sensor_msgs/msg/JointState")
+        self._tool = node.publisher("/tf", "tf2_msgs/msg/TFMessage")
         self._server = Server(node, ARM, FOLLOW, self._accept, self._cancel)
         bench.each.append(self._step)
 
@@ -76,6 +77,9 @@ class Arm:
             self._follow(self._path)
         if self._steps % _STATES_STEPS == 0:
             self._publish()
+        if self._steps % _TOOL_STEPS == 0:
+            body = self._bench.data.body("wrist_3_link")
+            self._tool(transform(self._node.new, "base_link", "wrist_3_link", body.xpos, body.xquat))
 
     def _guard(self) -> None:
         share = np.abs(self._bench.data.actuator_force[self._motors]) / self._limits

@@ -285,3 +285,15 @@ def _attachment(number: int, gid: bytes) -> bytes:
 def stamp(time_ns: int) -> dict[str, int]:
     """A builtin_interfaces/Time."""
     return {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+
+
+def transform(new: Interfaces, parent: str, child: str, place: Any, quaternion: Any) -> Any:
+    """A tf2_msgs/TFMessage of now; x y z in metres, w x y z."""
+    w, x, y, z = map(float, quaternion)
+    given = {
+        "translation": dict(zip("xyz", map(float, place), strict=True)),
+        "rotation": {"x": x, "y": y, "z": z, "w": w},
+    }
+    header = {"stamp": stamp(time.time_ns()), "frame_id": parent}
+    one = new("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=given)
+    return new("tf2_msgs/msg/TFMessage", transforms=[one])
