@@ -15,6 +15,8 @@ from stages.messages import Brake, RobotCommand, RobotState, Ros2Heard, Ros2Mess
 from stages.messages.robot import Stopped
 from stages.robots import BUILT_IN, read_robot
 
+_BATCH = 16
+"""What is heard is told so many messages at a time."""
 Said = RobotState | Ros2Sent | Ros2Heard
 
 
@@ -55,9 +57,9 @@ class Ros2Arm(Stage):
             yield from self._show(robot_command, why)
             return
         for _ in arm.carry_out(robot_command, lambda: ctx.rng.bytes(16)):
-            yield from self._told(ctx)
+            yield from self._told(ctx, at_least=_BATCH)
             yield None
-        yield from self._told(ctx)
+        yield from self._told(ctx, at_least=1)
         yield self._state(arm.stopped, arm.reason)
 
     def on_brake(self, brake: Brake) -> None:
@@ -82,13 +84,13 @@ class Ros2Arm(Stage):
         closes = command.gripper_width is not None and command.gripper_width < self._robot.gripper.open_width / 2
         yield self._state("fault" if closes else "", why)
 
-    def _told(self, ctx: Context) -> Iterator[Said]:
-        """What was sent and heard since the last time."""
+    def _told(self, ctx: Context, *, at_least: int) -> Iterator[Said]:
+        """What was sent since the last time, and what was heard, where it is so many messages."""
         while self._arm.said:
             ctx.log(self._arm.said.popleft(), level="warning")
         if self._arm.sent:
             yield Ros2Sent(messages=self._take(self._arm.sent))
-        if self._arm.heard:
+        if len(self._arm.heard) >= at_least:
             yield Ros2Heard(messages=self._take(self._arm.heard))
 
     @staticmethod

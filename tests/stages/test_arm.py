@@ -29,9 +29,9 @@ CALL = "/_action/send_goal"
 
 
 @contextlib.contextmanager
-def lab(endpoint: str) -> Iterator[FakeRobot]:
+def lab(endpoint: str, gripper_type: str = "GripperCommand") -> Iterator[FakeRobot]:
     with node(endpoint, "robot") as one:
-        robot = FakeRobot(one)
+        robot = FakeRobot(one, gripper_type)
         try:
             yield robot
         finally:
@@ -86,6 +86,16 @@ def test_it_follows_and_grips_and_all_that_was_said_is_a_message() -> None:
     heard = [one.topic for said_one in said if isinstance(said_one, Ros2Heard) for one in said_one.messages]
     assert sent == [WHERE.trajectory + CALL, WHERE.gripper + CALL]
     assert heard.count(WHERE.trajectory + "/_action/get_result") == 1 and heard.count(WHERE.joint_states) > 20
+
+
+def test_a_parallel_gripper_closes_on_what_is_there() -> None:
+    where = Controllers(efforts=False, gripper_type="ParallelGripperCommand")
+    with router() as endpoint, lab(endpoint, where.gripper_type) as robot, arm(endpoint, where) as stage:
+        robot.object = 0.3
+        state = state_of(stage, still(0.0))
+    (goal,) = robot.gripper.goals
+    assert state.stopped == "" and state.gripper_width == pytest.approx(robot.robot.gripper.width(0.3))
+    assert list(goal.command.name) == ["gripper_right_driver_joint"] and goal.command.effort.tolist() == [40.0]
 
 
 def test_a_goal_has_tolerances_and_the_operators_speed() -> None:

@@ -15,7 +15,7 @@ from stages.devices.ros2.settings import Controllers
 from stages.robots import Robot, read_robot
 
 ROBOT = Path(__file__).parents[4] / "stages" / "robots" / "ur5e.yaml"
-FOLLOW, GRIP = "control_msgs/action/FollowJointTrajectory", "control_msgs/action/GripperCommand"
+FOLLOW = "control_msgs/action/FollowJointTrajectory"
 JOINTS = "sensor_msgs/msg/JointState"
 WHERE = Controllers(efforts=False)
 EXECUTING, SUCCEEDED, CANCELED, ABORTED = 2, 4, 5, 6
@@ -78,7 +78,7 @@ class Action:
 class FakeRobot:
     """Publishes joint states from a thread until it is stopped; what it does wrong are its attributes."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, gripper_type: str = "GripperCommand") -> None:
         self.robot: Robot = read_robot(ROBOT)
         self.q = self.robot.home.copy()
         self.finger = 0.0
@@ -96,7 +96,8 @@ class FakeRobot:
         self._node = node
         self._states = node.publisher(WHERE.joint_states, JOINTS)
         self.arm = Action(node, WHERE.trajectory, FOLLOW)
-        self.gripper = Action(node, WHERE.gripper, GRIP)
+        self.gripper = Action(node, WHERE.gripper, f"control_msgs/action/{gripper_type}")
+        self._parallel = gripper_type == "ParallelGripperCommand"
         self._began = 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -134,14 +135,17 @@ class FakeRobot:
             )
 
     def _grip(self) -> None:
-        target = min(self.gripper.goals[-1].command.position, self.object)
+        told = self.gripper.goals[-1].command.position
+        target = min(float(told[0] if self._parallel else told), self.object)
         step = _GRIPPER_SPEED * _PERIOD
         self.finger += float(np.clip(target - self.finger, -step, step))
         if self.gripper.canceling:
             self.gripper.end(CANCELED)
         elif abs(self.finger - target) < 1e-6:
             stalled = target == self.object
-            self.gripper.end(SUCCEEDED, position=self.finger, stalled=stalled, reached_goal=not stalled)
+            state = {"state": {"position": [self.finger]}} if self._parallel else {"position": self.finger}
+            # Whoever is not configured to allow stalling calls a grasp aborted.
+            self.gripper.end(ABORTED if stalled else SUCCEEDED, stalled=stalled, reached_goal=not stalled, **state)
 
     def _publish(self) -> None:
         sec, nanosec = divmod(time.time_ns() - int(self.behind * 1e9), 10**9)
