@@ -216,6 +216,14 @@ def test_what_goes_wrong_is_one_line(what: str, stopped: str, says: str) -> None
     assert what != "quiet" or robot.arm.canceling, "what cannot be watched is not let go on"
 
 
+def test_an_arm_that_tells_no_efforts_feels_no_force_and_says_so_once() -> None:
+    logged: list[str] = []
+    with router() as endpoint, lab(endpoint), arm(endpoint, Controllers()) as stage:
+        said = run_stage(stage, [turn(0.05, 0.3), turn(0.05, 0.3)], log=lambda text, level: logged.append(text))
+    assert logged == ["/joint_states: gives no efforts; no force is felt"]
+    assert [one.force for one in said if isinstance(one, RobotState)] == [0.0, 0.0]
+
+
 def test_two_publishers_of_one_joint_are_named_and_nothing_moves() -> None:
     with router() as endpoint, lab(endpoint) as robot, arm(endpoint) as stage, node(endpoint, "ghost") as other:
         publisher = other.publisher(WHERE.joint_states, JOINTS)

@@ -110,9 +110,7 @@ class RemoteArm:
             {"positions": q, "time_from_start": {"sec": int(t), "nanosec": int(t % 1 * 1e9)}}
             for t, q in zip(command.times, command.positions, strict=True)
         ]
-        path = Path.trajectory(
-            self._types, [self._controllers.joints.get(one, one) for one in command.joint_names], points
-        )
+        path = Path.trajectory(self._types, self._names, points)
         posture = {"name": self._names, "position": self._joints.positions(self._names)}
         ghost = self._types.new(
             DISPLAY,
@@ -155,6 +153,10 @@ class RemoteArm:
 
     def _follow(self, command: RobotCommand, id: bytes) -> Iterator[None]:
         care, q = self._care, self.posture()
+        if command.joint_names != self._robot.joints:
+            raise _Broken(
+                "fault", f"commanded are {', '.join(command.joint_names)}; {', '.join(self._robot.joints)} move"
+            )
         away = np.abs(command.positions[0] - q).max()
         if away > _BESIDE:
             raise _Broken("fault", f"the arm is {away:.2f} rad from where the motion begins: it was moved")
@@ -177,7 +179,10 @@ class RemoteArm:
     def _felt(self, q: Floats) -> Felt | None:
         """None where no efforts are told."""
         measured = self._joints.efforts(self._names)
-        return None if self._efforts is None or np.isnan(measured).any() else Felt(self._efforts, q, measured)
+        if self._efforts is not None and np.isnan(measured).any():
+            self.said.append(f"{self._controllers.joint_states}: gives no efforts; no force is felt")
+            self._efforts = None
+        return None if self._efforts is None else Felt(self._efforts, q, measured)
 
     def _look(self, watch: _Watch, message: Any, guard: Guard | None) -> None:
         """Takes a joint state; raises where it breaks what must hold."""
@@ -214,6 +219,8 @@ class RemoteArm:
         self, client: ActionClient, type: str, id: bytes, fields: dict[str, Any], check: Callable[[Any], None]
     ) -> Generator[None, None, tuple[str, Any]]:
         """Has a goal carried out, while ``check`` takes every joint state; returns its status and result."""
+        if self._asked:
+            raise _Broken("stop", "as asked")
         name = client.name
         uuid = {"uuid": list(id)}
         request = self._types.new(
