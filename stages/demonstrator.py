@@ -333,7 +333,7 @@ class Demonstrator(Stage):
 
     def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
         """Looks at what the transfer did, whatever the hand has felt."""
-        stands = outcome.failed_stage == STOPPED or outcome.held
+        stands = outcome.failed_stage in (STOPPED, "fault") or outcome.held
         if stands and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
             self._state = replace(self._state, halted=True)
             stage = STOPPED if outcome.failed_stage == STOPPED else "executor"

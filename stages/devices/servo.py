@@ -138,12 +138,8 @@ class Servo:
         """Whether the robot must stop, and why."""
         if self._asked:
             self.stopped, self.reason = "stop", "as asked"
-        elif guard is not None and not guard.narrowest <= self.opening() <= guard.widest:
-            self.stopped, self.reason = "slip", f"the fingers are {1e3 * self.opening():.0f} mm apart"
-        elif guard is not None and self.force > guard.force:
-            self.stopped, self.reason = "touch", f"{self.force:.0f} N at the hand"
-        elif guard is not None and self.error > guard.error:
-            self.stopped, self.reason = "touch", f"a joint is {np.rad2deg(self.error):.1f} degrees off"
+        elif guard is not None and (broken := guard.broken(opening=self.opening(), force=self.force, error=self.error)):
+            self.stopped, self.reason = broken
         return bool(self.stopped)
 
     def _stand(self) -> None:

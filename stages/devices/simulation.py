@@ -50,18 +50,7 @@ class Simulation:
     ) -> None:
         """``factors``: of objects that are not as the catalogue has them."""
         self._robot, self._names, self.present = robot, names, names
-        spec = robot.specification()
-        option = spec.option
-        option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
-        # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
-        option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
-        floor.pos = [0, 0, robot.floor]
-        add_table(spec, table)
-        for name in names:
-            _add_object(spec, name, catalogue[label_of(name, catalogue)], factors.get(name, Factors()))
-        self._model = spec.compile()
+        self._model = scene_model(catalogue, robot, names, table, factors=factors)
         self._data = mujoco.MjData(self._model)
         self.servo = Servo(robot, self._model, self._data, self._step)
         self._joints = np.array([self._model.joint(name).qposadr[0] for name in robot.joint_names])
@@ -167,6 +156,29 @@ class Simulation:
         for name, position in gripper.posture(gripper.open_width).items():
             self._data.joint(name).qpos[0] = position
         self._data.ctrl[self.servo.fingers] = self.servo.grip(gripper.open_width)
+
+
+def scene_model(
+    catalogue: Catalogue,
+    robot: Robot,
+    names: tuple[str, ...],
+    table: Table,
+    *,
+    factors: Mapping[str, Factors] = MappingProxyType({}),
+) -> mujoco.MjModel:
+    """Robot, floor, table and objects; an object's free joint and body have its name."""
+    spec = robot.specification()
+    option = spec.option
+    option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+    # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+    floor.pos = [0, 0, robot.floor]
+    add_table(spec, table)
+    for name in names:
+        _add_object(spec, name, catalogue[label_of(name, catalogue)], factors.get(name, Factors()))
+    return spec.compile()
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, entry: CatalogueObject, factors: Factors) -> None:

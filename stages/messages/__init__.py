@@ -12,7 +12,7 @@ from stages.messages.digest import Candidate, Candidates, Hypothesis, Observatio
 from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
 from stages.messages.hand_eye import Abort, CalibrateCamera, CameraCalibration, Mounting
 from stages.messages.robot import Brake, RobotCommand, RobotState
-from stages.messages.ros2 import Asked, Ros2Message, Ros2Sent
+from stages.messages.ros2 import Asked, Ros2Heard, Ros2Message, Ros2Sent
 from stages.messages.scene import Assertion, ObjectPose, SceneGraph, VirtualObject
 from stages.messages.sensing import Frame, LookRequest, SensorErrors, Snapshot
 from stages.messages.task import (
@@ -87,6 +87,7 @@ __all__ = [
     "Rgb",
     "RobotCommand",
     "RobotState",
+    "Ros2Heard",
     "Ros2Message",
     "Ros2Sent",
     "SceneEstimate",

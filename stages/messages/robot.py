@@ -2,11 +2,14 @@
 
 from typing import Literal
 
+import numpy as np
+
 from runner.contract import Message, Struct
 from stages.messages.arrays import Matrix, Vector
 
-Stopped = Literal["", "stop", "slip", "touch"]
-"""Why a command was not carried out to its end: somebody asked, the fingers moved, or something was in the way."""
+Stopped = Literal["", "stop", "slip", "touch", "fault"]
+"""Why a command was not carried out to its end: somebody asked, the fingers moved, something was in the way, or the
+robot itself did not do it."""
 
 
 class Guard(Struct, frozen=True, kw_only=True):
@@ -23,6 +26,16 @@ class Guard(Struct, frozen=True, kw_only=True):
     """Newtons from outside, as if they acted on the hand: motor efforts beyond those that the motion takes."""
     error: float = 0.05
     """Radians (metres) by which a joint may be where it was not commanded to be."""
+
+    def broken(self, *, opening: float, force: float, error: float) -> tuple[Stopped, str] | None:
+        """Which of it does not hold for what is measured, and what that is; None where all does."""
+        if not self.narrowest <= opening <= self.widest:
+            return "slip", f"the fingers are {1e3 * opening:.0f} mm apart"
+        if force > self.force:
+            return "touch", f"{force:.0f} N at the hand"
+        if error > self.error:
+            return "touch", f"a joint is {np.rad2deg(error):.1f} degrees off"
+        return None
 
 
 class RobotCommand(Message, frozen=True, kw_only=True):

@@ -19,10 +19,18 @@ class Ros2Message(Struct, frozen=True, kw_only=True):
     """``package/msg/Name``, or with ``srv``."""
     data: Bytes
     """XCDR1, as it was sent."""
+    time_ns: int = 0
+    """When it was sent or had come, by this machine's clock; 0 in recordings that are older."""
 
 
 class Ros2Sent(Message, frozen=True, kw_only=True):
     """What a stage has published and answered in one step."""
+
+    messages: tuple[Ros2Message, ...]
+
+
+class Ros2Heard(Message, frozen=True, kw_only=True):
+    """What a stage has heard from nodes and acted on."""
 
     messages: tuple[Ros2Message, ...]
 

@@ -7,8 +7,11 @@ from stages.messages.arrays import Pose, Poses
 from stages.messages.correction import Arrived
 from stages.messages.scene import Assertion, Doubt, SceneGraph
 
-FailedStage = Literal["", "ik", "pick motion", "grasp", "place motion", "release", "slip", "touch", "unknown", "stop"]
-"""``unknown``: let go of without having felt that it stands. ``slip``, ``touch``: why a motion was broken off."""
+FailedStage = Literal[
+    "", "ik", "pick motion", "grasp", "place motion", "release", "slip", "touch", "unknown", "stop", "fault"
+]
+"""``unknown``: let go of without having felt that it stands. ``slip``, ``touch``, ``fault``: why a motion was broken
+off, see :data:`stages.messages.robot.Stopped`."""
 
 STOPPED = "stop"
 """Stands where an outcome or a verdict names the stage that failed: somebody asked to stop."""

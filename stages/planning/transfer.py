@@ -148,10 +148,11 @@ class TransferRoutine:
         return replace(self._outcome(*failure), number=0)
 
     def _come_back(self, broken: _BrokenOff) -> Steps:
-        """After a slip or a touch; where somebody asks to stop, and where the way back is barred, the arm stays."""
+        """After a slip or a touch; where somebody asks to stop, the robot fails or the way back is barred, the arm
+        stays."""
         newest = broken
         for _ in range(_WAYS_BACK):
-            if newest.state.stopped == "stop":
+            if newest.state.stopped in ("stop", "fault"):
                 break
             self._log(f"broken off: {newest}")
             try:
@@ -164,9 +165,10 @@ class TransferRoutine:
 
     def _stands(self, broken: _BrokenOff) -> tuple[FailedStage, str]:
         """The arm stays where it is."""
-        asked = broken.state.stopped == "stop"
-        why = "as asked" if asked else f"the way back is barred: {broken}"
-        return ("stop" if asked else "touch"), f"stopped, {why}; in the hand: {self.in_hand or 'nothing'}"
+        stopped = broken.state.stopped
+        failed: FailedStage = stopped if stopped in ("stop", "fault") else "touch"
+        why = {"stop": "as asked", "fault": str(broken)}.get(stopped, f"the way back is barred: {broken}")
+        return failed, f"stopped, {why}; in the hand: {self.in_hand or 'nothing'}"
 
     def _way_back(self, state: RobotState) -> Steps:
         """From wherever the arm stands: what is held goes back to where it was taken from, the hand goes home."""

@@ -19,7 +19,8 @@ from stages.messages import Frame
 
 _KEPT_SECONDS = 10.0
 """Of motion, and of looks that wait for it to be known."""
-_KEPT_LOOKS = 8
+_KEPT_LOOKS, _APART_NS = 30, 10**8
+"""Looks that wait for their transforms, and nanoseconds between them at least: 3 s of memory."""
 _MOVING, _STATIC = Qos(depth=100), Qos(latched=True, depth=100)
 """Of transforms, as tf2 asks for them."""
 
@@ -35,6 +36,8 @@ class LiveCamera:
         self._pairs = Pairs(source.slop)
         self._looks: deque[Pair] = deque(maxlen=_KEPT_LOOKS)
         """Taken and received since a look was asked for."""
+        self.pairs = 0
+        """Of colour and depth, put together so far."""
         self._info: Any = None
         self._newest: dict[str, tuple[int, int]] = {}
         """By image topic: when its newest message came and what its stamp says, nanoseconds."""
@@ -95,7 +98,10 @@ class LiveCamera:
         stamp, now = stamp_ns(received.message.header), time.time_ns()
         self._newest[self._source.images[is_depth]] = now, stamp
         pair = self._pairs.add(stamp, received.message, is_depth=is_depth)
-        if pair is not None and pair.stamp_ns >= self._asked_ns and _age(now, stamp) <= self._patience.max_age:
+        self.pairs += pair is not None
+        if pair is None or pair.stamp_ns < self._asked_ns or _age(now, stamp) > self._patience.max_age:
+            return
+        if not self._looks or pair.stamp_ns - self._looks[-1].stamp_ns >= _APART_NS:
             self._looks.append(pair)
 
     def _wait(self) -> Pair | None:

@@ -142,10 +142,10 @@ class Client:
 class Goal:
     """A goal that an action server has accepted."""
 
-    def __init__(self, id: bytes, result: Future[Any], cancel: Client) -> None:
+    def __init__(self, client: ActionClient, id: bytes, result: Future[Any]) -> None:
+        self._client = client
         self._id = id
         self._result = result
-        self._cancel = cancel
 
     def result(self, seconds: float) -> tuple[str, Any]:
         """How it ended, a word of :data:`STATUSES`, and its result.
@@ -163,8 +163,7 @@ class Goal:
         Raises:
             Unanswered: no answer came.
         """
-        goal = {"goal_id": {"uuid": list(self._id)}}
-        return self._cancel.call(seconds=seconds, goal_info=goal).return_code == 0
+        return self._client.cancel(self._id, seconds=seconds)
 
 
 class ActionClient:
@@ -173,6 +172,7 @@ class ActionClient:
     def __init__(self, node: Node, name: str, type: str) -> None:
         self._node = node
         self._type = type
+        self.name = name
         parts = f"{name}/_action"
         self._send = Client(node, f"{parts}/send_goal", f"{type}_SendGoal")
         self._get = Client(node, f"{parts}/get_result", f"{type}_GetResult")
@@ -201,7 +201,16 @@ class ActionClient:
         response = self._send.call(seconds=seconds, goal_id=uuid, goal=goal_message)
         if not response.accepted:
             raise Unanswered(f"{self._send.name}: the goal was rejected")
-        return Goal(id, self._get.start(seconds=LONG_SECONDS, goal_id=uuid), self._cancel)
+        return Goal(self, id, self._get.start(seconds=LONG_SECONDS, goal_id=uuid))
+
+    def cancel(self, id: bytes, *, seconds: float) -> bool:
+        """Asks the server to give a goal up, of which nobody needs to know whether it was accepted; False where it
+        will not.
+
+        Raises:
+            Unanswered: no answer came.
+        """
+        return self._cancel.call(seconds=seconds, goal_info={"goal_id": {"uuid": list(id)}}).return_code == 0
 
     def _on_feedback(self, received: Received) -> None:
         with self._changing:

@@ -78,6 +78,58 @@ class Patience:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Controllers:
+    """Where an arm and its gripper are heard and commanded, and what their joints are called there."""
+
+    joint_states: str = "/joint_states"
+    trajectory: str = "/joint_trajectory_controller/follow_joint_trajectory"
+    """Action of type control_msgs/action/FollowJointTrajectory."""
+    gripper: str = "/gripper_controller/gripper_cmd"
+    gripper_type: Literal["GripperCommand", "ParallelGripperCommand"] = "GripperCommand"
+    gripper_unit: Literal["joint", "opening"] = "joint"
+    """What the gripper is told and says: a position of the description's first finger joint, or metres between the
+    fingers."""
+    gripper_effort: float = 40.0
+    """Newtons (newton metres) with which it closes at most."""
+    gripper_joint: str = ""
+    """Whose position says how far the gripper is open; empty: the first finger joint of the description."""
+    joints: dict[str, str] = field(default_factory=dict[str, str])
+    """Names in joint states and trajectories of joints that the robot's description calls otherwise."""
+    efforts: bool = True
+    """Efforts in the joint states are torques with the arm's own weight in them, newton metres; false where they are
+    currents or nothing: then no force is felt."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Care:
+    """How motions are carried out and when they are given up; seconds, radians (metres)."""
+
+    speed: float = 1.0
+    """Share of the planned speed."""
+    path_tolerance: float = 0.1
+    goal_tolerance: float = 0.03
+    """What the controller is told: how far a joint may be from where it should be, on the way and at the end."""
+    goal_time: float = 2.0
+    """How much longer than planned the controller may take at the end."""
+    stale: float = 0.3
+    """After so long without a joint state nothing is known of the arm."""
+    max_age: float = 1.0
+    """Between a joint state's stamp and its arrival."""
+    stuck: float = 5.0
+    """For how long a motion may make no progress."""
+    answer: float = 2.0
+    """For how long a controller may owe an answer."""
+
+    def __post_init__(self) -> None:
+        """Refuses what would not move, or at once be given up."""
+        if not 0 < self.speed <= 1:
+            raise Refused(f"care.speed = {self.speed:g}: must be above 0 and at most 1")
+        for name in ("path_tolerance", "goal_tolerance", "goal_time", "stale", "max_age", "stuck", "answer"):
+            if not getattr(self, name) > 0:
+                raise Refused(f"care.{name} = {getattr(self, name):g}: must be above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Frames:
     """Names of frames among the lab's transforms."""
 

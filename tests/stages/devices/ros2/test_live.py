@@ -39,6 +39,8 @@ class Driver:
         self.x: Callable[[float], float] | None = lambda now: 0.5
         self.behind = 0.0
         """Seconds by which the stamps are."""
+        self.late = 0.0
+        """Seconds by which the newest transform is older than the newest image."""
         kind = "sensor_msgs/msg/CompressedImage" if source is COMPRESSED else "sensor_msgs/msg/Image"
         self._publishers = {
             "color": node.publisher(source.color, kind, SENSOR),
@@ -62,7 +64,7 @@ class Driver:
             if self.x is not None:
                 T = np.eye(4)
                 T[0, 3] = self.x(time.monotonic())
-                self._publishers["tf"].put(transform("base_link", "arm", T, stamp))
+                self._publishers["tf"].put(transform("base_link", "arm", T, stamp - int(self.late * 1e9)))
             self._publishers["info"].put(info(K, (24, 32)))
             self._publishers["color"].put(self.color(stamp))
             if self.depth is not None:
@@ -117,6 +119,35 @@ def test_a_camera_that_moves_is_waited_for() -> None:
         frame, said = look(endpoint)
     assert frame.T_base_camera is not None and abs(frame.T_base_camera[0, 3]) < 1e-3
     assert f"no look yet: the camera, frame '{CAMERA}', moves" in said
+
+
+def test_transforms_that_come_late_are_waited_for_never_guessed() -> None:
+    with router() as endpoint, driver(endpoint) as camera:
+        camera.late = 0.5
+        frame, said = look(endpoint)
+    assert time.time_ns() - frame.stamp_ns > 0.4e9, "the image of which the transform has come"
+    assert all("base_link to arm is not known at" in line for line in said)
+
+
+def stop_transforms(camera: Driver) -> None:
+    camera.x = None
+
+
+@pytest.mark.parametrize(
+    ("stop", "says"),
+    [
+        (Driver.stop, f"{SOURCE.color}: is published, but no message has come for [0-9.]+ s"),
+        (stop_transforms, "base_link to arm is not known at .*: it is from .* to "),
+    ],
+)
+def test_what_stops_between_two_looks_is_named(stop: Callable[[Driver], None], says: str) -> None:
+    with router() as endpoint, driver(endpoint) as running:
+        camera = Ros2Camera(Ros2Camera.Config(link=Link(router=endpoint), patience=Patience(give_up=2.0, warn=0.5)))
+        assert len(run_stage(camera, [LookRequest(purpose="first")])) == 1
+        stop(running)
+        with pytest.raises(Refused, match=says):
+            run_stage(camera, [LookRequest(purpose="second")], log=lambda text, level: None)
+        camera.close()
 
 
 def test_who_comes_later_is_waited_for() -> None:

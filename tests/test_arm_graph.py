@@ -1,0 +1,65 @@
+"""An arm behind ROS 2 in a graph whose lab loses its router: nothing is lost from the recording, and it replays."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from runner.graph.graph import load_graph
+from runner.testing import finish, read_until, start_graph
+from stages.messages import RobotCommand, RobotState, Ros2Heard, Ros2Sent
+from tests.stages.devices.ros2.lab import free_port, node, open_router, wait_until
+from tests.stages.devices.ros2.robot import ROBOT, WHERE, FakeRobot
+
+ROOT = Path(__file__).parents[1]
+GRAPH = """
+name: arm
+stages:
+  commander:
+    stage: tests.stages.devices.ros2.commander:Commander
+    inputs: {robot_state: arm.robot_state}
+  arm:
+    stage: stages.arm:Ros2Arm
+    config: {armed: true, calibrated: true, controllers: {efforts: false}, care: {stale: 1.0, answer: 5.0}}
+    inputs: {robot_command: commander.robot_command, brake: commander.brake}
+"""
+
+
+@pytest.mark.slow
+def test_a_router_that_dies_costs_nothing_of_the_recording(tmp_path: Path) -> None:
+    port = free_port()
+    router = open_router(port)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with node(endpoint, "robot") as one:
+        robot = FakeRobot(one)
+        graph = start_graph(GRAPH, f"arm.robot={ROBOT}", f"arm.link.router={endpoint}", folder=tmp_path)
+        printed = read_until(graph, "processes are ready")
+        try:
+            wait_until(lambda: robot.arm.busy, 20.0)
+            begun = robot.q.copy()
+            wait_until(lambda: abs(robot.q - begun).max() > 0.05)
+            router.close()
+        finally:
+            robot.stop()
+            run = finish(graph, tmp_path, before=printed)
+    assert "COMPLETE" in run.output and "could not be told to stop" in run.output, run.output
+    states, commands = run.messages(RobotState), run.messages(RobotCommand)
+    assert states[-1].stopped == "fault" and len(states) == len(commands)
+    sent = [item for message in run.messages(Ros2Sent) for item in message.messages]
+    heard = [item for message in run.messages(Ros2Heard) for item in message.messages]
+    assert [item.topic for item in sent][-2:] == [
+        f"{WHERE.trajectory}/_action/{call}" for call in ("send_goal", "cancel_goal")
+    ]
+    positions = [
+        one.types.decode(item.data.tobytes(), item.type).position[5] for item in heard if "states" in item.topic
+    ]
+    assert max(positions) - min(positions) > 0.05, "what it heard until then"
+    command = [sys.executable, "-m", "runner.cli", "replay", str(run.recording), "--verify"]
+    replay = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert replay.returncode == 0 and "IDENTICAL" in replay.stdout, replay.stdout + replay.stderr
+
+
+def test_the_graph_of_a_lab_moves_nothing_as_it_stands() -> None:
+    config = load_graph(ROOT / "graphs" / "arm.yaml").nodes["arm"].config
+    assert not config.armed and not config.calibrated
