@@ -26,6 +26,7 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
 from stages.messages import (
     Arrangement,
+    Arrived,
     Goal,
     LookRequest,
     Observation,
@@ -172,7 +173,7 @@ class Robot:
         turn = Rotation.from_rotvec(rng.normal(0, np.deg2rad(1.0), 3)).as_matrix()
         return pose(turn @ T[:3, :3], T[:3, 3] + rng.normal(0, self._metres, 3))
 
-    def _carry_out(self, answer: RobotCommand | Outcome | None) -> Outcome:
+    def _carry_out(self, answer: RobotCommand | Outcome | Arrived | None) -> Outcome:
         while isinstance(answer, RobotCommand):
             states = self._world.on_robot_command(answer, self._ctx)
             state = next(each for each in states if each is not None)
