@@ -1,26 +1,59 @@
-"""What the table of looks counts as missed and as false."""
+"""What the table of looks calls wrong."""
 
+import msgspec
 import numpy as np
 
-from benchmarks.looks import compared
-from stages.geometry.poses import pose
-from stages.messages import SceneGraph, Snapshot
-from stages.messages.scene import SceneObject
+from benchmarks.looks import Judge, as_seen
+from stages.geometry.arrays import Floats
+from stages.geometry.poses import exp_so3, inverse, pose
+from stages.messages import SceneGraph, SensorErrors, Snapshot
+from stages.messages.scene import Assertion, SceneObject
+from stages.robots import BUILT_IN as FETCH
+from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
+ROBOT = read_robot(FETCH)
+CATALOGUE = Catalogue.shared(BUILT_IN)
 
-def at(x: float) -> np.ndarray:
-    return pose(np.eye(3), np.array([x, 0.0, 0.7]))
+
+def standing(label: str, x: float) -> Floats:
+    return pose(np.eye(3), np.array([x, 0.0, 0.7 - CATALOGUE[label].bounds[0, 2]]))
 
 
-def test_what_stands_elsewhere_is_missed_and_false_and_an_offset_of_the_camera_is_neither() -> None:
-    snapshot = Snapshot(
-        names=("mug", "cup", "bowl"), T_base_objects=np.stack([at(0.5), at(0.7), at(0.9)]), joint_names=(),
-        joint_positions=np.zeros(0), time=0.0,
+def snapshot(**places: float) -> Snapshot:
+    return Snapshot(
+        names=tuple(places), T_base_objects=np.stack([standing(name, x) for name, x in places.items()]),
+        joint_names=tuple(ROBOT.posture), joint_positions=np.array(list(ROBOT.posture.values())), time=0.0,
+        T_base_table=pose(np.eye(3), np.array([0.6, 0.0, 0.7])),
     )  # fmt: skip
-    seen = {"mug": 0.52, "cup": 0.8, "plate": 0.3}
-    scene = SceneGraph(
-        objects=tuple(SceneObject(name=name, label=name, T_base_object=at(x)) for name, x in seen.items()),
-        virtual_objects=(), assertions=(), T_base_table=np.eye(4), T_base_camera=np.eye(4), K=np.eye(3),
+
+
+def perceived(poses: dict[str, Floats], *assertions: Assertion) -> SceneGraph:
+    return SceneGraph(
+        objects=tuple(SceneObject(name=name, label=name, T_base_object=T) for name, T in poses.items()),
+        virtual_objects=(), assertions=assertions, T_base_table=np.eye(4), T_base_camera=np.eye(4), K=np.eye(3),
     )  # fmt: skip
-    assert compared(snapshot, scene, Catalogue.shared(BUILT_IN)) == (["cup", "bowl"], ["2 false"])
+
+
+def test_what_is_missed_false_beside_its_place_and_wrongly_related_is_said() -> None:
+    true = snapshot(tea_box=0.5, cup=0.7, bowl=0.9)
+    seen = {"tea_box": standing("tea_box", 0.51), "cup": standing("cup", 0.73), "plate": standing("plate", 0.3)}
+    found = perceived(seen, Assertion(predicate="on", arguments=("tea_box", "table")))
+    wrong = ["missed bowl", "1 false", "cup 30 mm 0 deg", "not on(cup, table)"]
+    assert Judge(CATALOGUE).wrong(true, true, found) == wrong
+
+
+def test_the_cameras_own_errors_are_none_of_perceptions() -> None:
+    true = snapshot(tea_box=0.8)
+    T_base_camera = ROBOT.camera_pose(true.joint_names, true.joint_positions)
+    off = pose(exp_so3(np.array([0.0, 0.008, 0.0])), np.array([0.0, 0.005, 0.0]))
+    errors = SensorErrors(
+        depth=1.02, T_believed_true=off, T_color_depth=np.eye(4), joints=np.zeros(len(true.joint_names)),
+        gains=np.ones(3),
+    )  # fmt: skip
+    biased = as_seen(msgspec.structs.replace(true, errors=errors), T_base_camera, ROBOT)
+    T_camera_object = inverse(T_base_camera @ off) @ true.T_base_objects[0]
+    T_camera_object[:3, 3] *= 1.02
+    np.testing.assert_allclose(biased.T_base_objects[0], T_base_camera @ T_camera_object, atol=1e-12)
+    on_table = Assertion(predicate="on", arguments=("tea_box", "table"))
+    assert not Judge(CATALOGUE).wrong(true, biased, perceived({"tea_box": biased.T_base_objects[0]}, on_table))
