@@ -32,7 +32,8 @@ class Task:
         form, window = self.form, self.window
         seen = (inverse > window.inverse_background) & (window.factor > 0)
         behind = window.factor[seen] * (1 / inverse[seen] - window.observed[seen])
-        costs = np.minimum(np.abs(behind), form.truncation) - window.credit[seen]
+        credit = window.credit[seen]
+        costs = np.maximum(np.minimum(np.abs(behind), form.truncation) - np.abs(credit), np.minimum(-credit, 0))
         return float(np.where(behind > form.occluder_margin, form.occluder_cost, costs).sum())
 
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
+from stages.geometry.masks import Mask, dilated, eroded, opened
 from stages.geometry.poses import rotate
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Float32s
-
-Mask = NDArray[np.bool_]
 
 _MARGIN = 0.012
 """Metres along the ray, at one metre, that no reading of a well-placed surface is off; grows with the square of depth
@@ -52,7 +50,7 @@ def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[R
     ``layers`` are the objects' inverse depths, H x W each. Readings within a few pixels of a silhouette do not count:
     there they may be of either side, or of neither.
     """
-    lonely = _opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
+    lonely = opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
     count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
     found = [_region(scene, labels == number) for number in range(1, count)]
     # How components are numbered may depend on the number of threads; their order here must not.
@@ -65,7 +63,7 @@ def looked_through(scene: ObservedScene, layer: Float32s, others: Float32s) -> f
     ``layer`` and ``others`` are H x W inverse depths of the object, and of the plane and all other objects. 0 where
     there are no readings: no evidence.
     """
-    inner = _eroded(layer > 0, max(1, _edge(scene) // 2))
+    inner = eroded(layer > 0, max(1, _edge(scene) // 2))
     seen = inner & (layer >= others) & (scene.factor > 0)
     behind = scene.depth - 1.0 / np.where(seen, layer, 1.0)
     through = seen & (behind > _margin(scene))
@@ -86,7 +84,7 @@ def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
     for layer in layers:
         shown = layer > 0
         on_it = shown & (np.abs(1.0 / np.where(shown, layer, 1.0) - scene.depth) < margin)
-        rim = _dilated(shown, _edge(scene)) & ~_eroded(shown, _edge(scene))
+        rim = dilated(shown, _edge(scene)) & ~eroded(shown, _edge(scene))
         open_readings &= ~(on_it | rim)
     return open_readings
 
@@ -116,21 +114,3 @@ def _growth(scene: ObservedScene) -> Floats:
 
 def _edge(scene: ObservedScene) -> int:
     return max(2, round(_EDGE * scene.view.width / 640))
-
-
-def _eroded(mask: Mask, radius: int) -> Mask:
-    return cv2.erode(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
-
-
-def _dilated(mask: Mask, radius: int) -> Mask:
-    return cv2.dilate(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
-
-
-def _opened(mask: Mask, radius: int) -> Mask:
-    """The mask without parts thinner than a disc; single missing readings do not tear it."""
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(1))
-    return cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(radius)).astype(bool) & mask
-
-
-def _disc(radius: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)

@@ -62,7 +62,7 @@ class Batch:
         self.launch = launch or Launch()
         self._meshes = _meshes(shapes, self.launch)
         self._windows = _windows(looks)
-        self.bases = np.array([look.window.credit.sum(dtype=np.float64) for look in looks])
+        self.bases = np.array([look.window.base for look in looks])
         """Cost of each window without the object, W, metres times pixels."""
         widest = max(look.window.view.width for look in looks)
         # Polish looks at the rows above and below.

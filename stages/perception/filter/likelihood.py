@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from stages.geometry.arrays import Floats
+from stages.perception.observation.plane import height_above, stands_out
 from stages.perception.rendering.kernels import change_of_cost, evidence, gauss_newton
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
@@ -37,6 +38,8 @@ class CostForm:
     * A reading more than ``occluder_margin`` in front of the rendered surface: something unknown hides the object.
       The pixel stays as unexplained as it was and costs ``occluder_cost`` besides.
     * Otherwise the distance between the two points, at most ``truncation``.
+    * A reading of the plane costs nothing, though it misses the plane by the sensor's noise: whatever covers it, such
+      as the floor of a tray, may miss it by as much.
 
     ``plain`` is the paper's plain sum: a pixel is worth explaining by all that the background misses it by.
     """
@@ -76,6 +79,8 @@ class ObservedScene:
     foreground: NDArray[np.bool_]
     plane_inverse: Float32s
     """1/z of the support plane, 0 above its horizon."""
+    leeway: Float32s
+    """By how much readings of the plane miss it, metres; 0 for all others."""
     T_camera_table: Floats
 
     @staticmethod
@@ -85,14 +90,17 @@ class ObservedScene:
         view = View.of(K, width, height)
         rays = view.rays()
         normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
-        inverse = (rays * normal).sum(-1) / (normal * origin).sum()
+        inverse = np.maximum((rays * normal).sum(-1) / (normal * origin).sum(), 0.0)
         factor = np.sqrt((rays**2).sum(-1)) * (depth > 0)
+        of_plane = ~foreground & ~stands_out(np.abs(height_above(depth, view, T_camera_table)), depth)
+        miss = np.abs(factor * (1.0 / np.maximum(inverse, 1 / _FAR) - depth))
         return ObservedScene(
             view,
             np.ascontiguousarray(depth, np.float32),
             factor.astype(np.float32),
             foreground & (depth > 0),
-            np.maximum(inverse, 0.0).astype(np.float32),
+            inverse.astype(np.float32),
+            np.where(of_plane, miss, 0.0).astype(np.float32),
             np.asarray(T_camera_table, float),
         )
 
@@ -134,11 +142,17 @@ class Window:
     observed: Float32s
     factor: Float32s
     credit: Float32s
-    """What the background costs where the object may take credit for explaining it: inside its box."""
+    """What the background costs where the object may take credit for explaining it: inside its box. Where it costs
+    nothing though it misses the reading, what it misses it by, below zero."""
     box: Floats
     """The candidate's box x0, y0, x1, y1 in pixels of this window."""
     reach: tuple[float, float]
     """Smallest and largest depth of what the object may explain, metres, outliers apart."""
+
+    @property
+    def base(self) -> float:
+        """Cost of the window without the object, metres times pixels."""
+        return float(np.maximum(self.credit, 0.0).sum(dtype=np.float64))
 
     @staticmethod
     def of(
@@ -159,6 +173,8 @@ class Window:
         credit = np.zeros((y1 - y0, x1 - x0), np.float32)
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
         credit[box[1] - y0 : box[3] - y0, box[0] - x0 : box[2] - x0] = credits(scene, background, form, (rows, columns))
+        if not form.plain:
+            credit -= scene.leeway[y0:y1, x0:x1]
         credit = credit[::stride, ::stride]
         open_depths = scene.depth[part][credit > 0]
         low, high = np.percentile(open_depths, [2, 98]) if len(open_depths) else (0.0, np.inf)
@@ -245,8 +261,7 @@ class ObjectLikelihood:
         self.form = form
         self.plane = scene.plane
         """Unit normal and offset of the support plane."""
-        self.base = float(window.credit.sum(dtype=np.float64))
-        """Cost of the window without the object."""
+        self.base = window.base
         self._evaluator = evaluator(shape, window, self.plane, form)
 
     def costs(self, poses: Floats) -> Floats:

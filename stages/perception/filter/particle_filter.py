@@ -15,6 +15,7 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.perception.filter.evolution import (
     CPU,
+    PROGRESS,
     THINNED,
     Device,
     Generation,
@@ -39,6 +40,10 @@ _FRESH = 2
 """New guesses per particle when an object is visited again."""
 _LEADERS = 6
 """Poses that are polished to the end."""
+_STEPS = 0.004, 0.002, 0.001
+"""Metres by which the best pose is moved at last, and its outermost points by turns."""
+_MOVES = 6
+"""Moves of one size at most."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +227,28 @@ class _Run:
             costs = likelihood.energies(poses)
         champion = int(np.argmin(costs))
         self._keep(Generation(float(costs[champion]), poses[::THINNED, :, 3].copy()))
-        return self._track(poses[champion], float(costs[champion]))
+        pose, cost = poses[champion], float(costs[champion])
+        return self._track(*(self._searched(pose, cost) if self._settings.polished else (pose, cost)))
+
+    def _searched(self, pose: Floats, cost: float) -> tuple[Floats, float]:
+        """Pattern search (Hooke and Jeeves, 1961) along and about the object's own axes, with ever smaller steps.
+
+        Gauss-Newton steps read distances on smooth faces; this moves rims and silhouettes to where they are seen.
+        """
+        fine = self.phases[1]
+        radius = fine.likelihood.shape.diameter / 2
+        for step in _STEPS:
+            for _ in range(_MOVES):
+                twists = self._proposals.own_directions(pose, fine.directions) * step
+                twists[:3] /= radius
+                both = np.concatenate([twists.T, -twists.T])
+                around = self._proposals.moved(np.repeat(pose[None], len(both), 0), both)
+                costs = fine.likelihood.energies(around)
+                best = int(np.argmin(costs))
+                if costs[best] >= PROGRESS * cost:
+                    break
+                pose, cost = around[best], float(costs[best])
+        return pose, cost
 
     def _leaders(self, poses: Floats, costs: Floats) -> Floats:
         """The best of the distinct poses and of all flips of the first, before and after polish; polish sorts them out

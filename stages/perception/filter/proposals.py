@@ -92,6 +92,13 @@ class Proposals:
         basis[3:, 2] = T_camera_table[:3, 1]
         return basis
 
+    def own_directions(self, pose: Floats, directions: Floats) -> Floats:
+        """The twists that the object may make, along and about its own axes where it may make any."""
+        if self.dof == 3:
+            return directions
+        axes = compose(pose[:, :3], self.axes)
+        return np.block([[axes, np.zeros((3, 3))], [np.zeros((3, 3)), axes]])
+
     def diffuse(
         self, poses: Floats, directions: Floats, *, metres: float, radians: float, rng: np.random.Generator
     ) -> Floats:

@@ -11,6 +11,7 @@ from stages.geometry.arrays import Floats
 from stages.messages.digest import GLIMPSE_STRIDE, Glimpse, Start
 from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
 from stages.perception.filter.particle_filter import pixels
+from stages.perception.observation.plane import height_above, stands_out
 from stages.perception.rendering.rasteriser import Float32s
 
 REACH = 0.25
@@ -84,6 +85,8 @@ def pixel_costs(
     shown = (nearest > scene.plane_inverse) & (scene.factor > 0)
     behind = scene.factor * (1.0 / np.where(shown, nearest, 1.0) - scene.depth)
     distance = np.minimum(np.abs(behind), form.truncation)
+    if not form.plain:
+        distance = np.maximum(distance - scene.leeway, 0.0)
     explained = distance if allowed is None else np.where(allowed, distance, credit + distance)
     return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
 
@@ -114,14 +117,17 @@ def claim(scene: ObservedScene, layer: Float32s, form: CostForm) -> tuple[float,
 def rise(scene: ObservedScene, layer: Float32s, form: CostForm) -> float:
     """Metres by which an object (H x W inverse depth) stands out of the plane along the rays, bounded, on average.
 
-    What lies flat, as a tray does, cannot explain more of its box than this.
+    What lies flat, as a tray does, cannot explain more of its box than this. Its readings are the plane's own where it
+    stands out no farther than these stray: there is nothing to be explained.
     """
     shown = (layer > scene.plane_inverse) & (scene.factor > 0)
     if not shown.any():
         return form.truncation
     plane = np.where(scene.plane_inverse > 0, scene.plane_inverse, np.float32(1e-6))[shown]
-    out = scene.factor[shown] * (1.0 / plane - 1.0 / layer[shown])
-    return float(np.minimum(out, form.truncation).mean(dtype=np.float64))
+    z = 1.0 / np.where(shown, layer, 1.0)
+    out = scene.factor[shown] * (1.0 / plane - z[shown])
+    asked = stands_out(height_above(z, scene.view, scene.T_camera_table), z)[shown]
+    return float((np.minimum(out, form.truncation) * asked).mean(dtype=np.float64))
 
 
 def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm) -> tuple[float, float]:

@@ -24,6 +24,8 @@ _SHARE = 0.1
 """Of the readings near the objects as many must lie on the support plane; on real tables a third and more do."""
 _BELOW = 0.5
 """What a reading below the plane takes away, in readings on it."""
+_CLEARANCE = 0.003
+"""Metres above the plane's noise up to which a reading may be the plane's own."""
 _CELL = 0.01
 _PER_CELL = 3
 """Readings that show a cell of the support surface."""
@@ -54,7 +56,7 @@ def find_plane(
     return _frame(plane, points) if _near(plane, points).mean() >= _SHARE else None
 
 
-def height_above(depth: Float32s, view: View, T_camera_table: Floats) -> Float32s:
+def height_above(depth: NDArray[np.floating], view: View, T_camera_table: Floats) -> Float32s:
     """Height of every reading above the plane, H x W metres; meaningless where there is no reading."""
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
     slope = (view.rays() * normal).sum(-1)
@@ -92,6 +94,11 @@ def _largest_part(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def noise(z: NDArray[np.floating]) -> NDArray[np.floating]:
     """How far a reading of a structured-light sensor at depth ``z`` strays from a plane, metres (about 2 sigma)."""
     return 0.003 + 0.003 * z**2
+
+
+def stands_out(height: NDArray[np.floating], z: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which surfaces at depth ``z`` are too far above the plane for their readings to be the plane's own."""
+    return height > noise(z) + _CLEARANCE
 
 
 def _points(depth: Float32s, view: View, objects: Floats) -> Floats:

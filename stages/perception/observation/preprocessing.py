@@ -11,13 +11,11 @@ from runner.contract import Refused
 from stages.geometry.arrays import Floats
 from stages.messages.digest import Candidate, Observation
 from stages.messages.sensing import Frame
-from stages.perception.observation.plane import find_plane, height_above, noise, support_region
+from stages.perception.observation.plane import find_plane, height_above, stands_out, support_region
 from stages.perception.rendering.rasteriser import Float32s, View
 
 _MARGIN = 0.5
 """The working area reaches beyond the candidates' boxes by this share of their common extent."""
-_CLEARANCE = 0.003
-"""Metres above the plane's noise at which foreground begins."""
 
 
 def preprocess(
@@ -36,7 +34,7 @@ def preprocess(
     if T_camera_table is None:
         raise Refused(_no_plane(frame, depth))
     height = height_above(depth, view, T_camera_table)
-    foreground = (depth > 0) & (height > noise(depth) + _CLEARANCE) & (height < max_height)
+    foreground = (depth > 0) & stands_out(height, depth) & (height < max_height)
     return Observation(
         depth=depth,
         rgb=frame.rgb,

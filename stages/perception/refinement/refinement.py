@@ -427,5 +427,5 @@ def _cropped(scene: ObservedScene, region: Rectangle) -> ObservedScene:
     part = np.s_[y0:y1, x0:x1]
     return ObservedScene(
         scene.view.sampled(*region, 1), scene.depth[part], scene.factor[part], scene.foreground[part],
-        scene.plane_inverse[part], scene.T_camera_table,
+        scene.plane_inverse[part], scene.leeway[part], scene.T_camera_table,
     )  # fmt: skip

@@ -102,9 +102,12 @@ def triangle_setup(ax, ay, az, bx, by, bz, cx, cy, cz, m, left, right, top, bott
 
 @numba.njit(**INLINED)
 def pixel_cost(q, background, observed, factor, credit, truncation, margin, occluder):
-    """What a pixel costs with the object at inverse depth ``q`` there, less what it costs without; 0 where hidden."""
+    """What a pixel costs with the object at inverse depth ``q`` there, less what it costs without; 0 where hidden.
+
+    Without it costs ``credit``; nothing where that is negative: the object may miss such a reading by as much.
+    """
     behind = factor * (_ONE / q - observed)
-    cost = min(abs(behind), truncation) - credit
+    cost = max(min(abs(behind), truncation) - abs(credit), min(-credit, _ZERO))
     cost = occluder if behind > margin else cost
     return cost if (q > background and factor > _ZERO) else _ZERO
 

@@ -120,8 +120,10 @@ def definition(cpu: ObjectLikelihood, mesh: Mesh, T: Floats, plane: Floats) -> f
     q = oracle.inverse_depth(mesh, T, window.view)
     shown = (q > window.inverse_background) & (window.factor > 0)
     behind = window.factor * (1 / np.where(shown, q, 1) - window.observed)
-    cost = np.where(behind > form.occluder_margin, form.occluder_cost, np.minimum(abs(behind), form.truncation)
-                    - window.credit)  # fmt: skip
+    distance = np.minimum(abs(behind), form.truncation)
+    free = np.maximum(-window.credit, 0)
+    explained = np.maximum(distance - free, 0) - np.maximum(window.credit, 0)
+    cost = np.where(behind > form.occluder_margin, form.occluder_cost, explained)
     heights = (mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ plane[:3] + plane[3]
     sunk = max(0.0, -heights.min() - form.contact_slack) * window.factor.size
     return float(cost[shown].sum() + sunk)

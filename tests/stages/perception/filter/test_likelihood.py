@@ -5,6 +5,7 @@ import pytest
 
 from stages.geometry.poses import exp_so3, pose
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
+from stages.perception.observation.plane import height_above
 from tests.stages.perception import oracle
 from tests.stages.perception.scenes import CATALOGUE, K, render, upright
 
@@ -34,8 +35,18 @@ def definition(scene: ObservedScene, mesh, T: np.ndarray, background: np.ndarray
                 continue
             distance = np.linalg.norm(rays[v, u] / rendered[v, u] - observed)
             hidden = (1 / rendered[v, u] - scene.depth[v, u]) * length > form.occluder_margin
-            total += credit + form.occluder_cost if hidden else min(distance, form.truncation)
+            of_plane = (
+                not plain and not scene.foreground[v, u] and above(scene, observed) <= 0.006 + 0.003 * observed[2] ** 2
+            )
+            free = length * abs(1 / scene.plane_inverse[v, u] - scene.depth[v, u]) if of_plane else 0.0
+            explained = max(min(distance, form.truncation) - free, 0.0)
+            total += credit + form.occluder_cost if hidden else explained
     return total
+
+
+def above(scene: ObservedScene, point: np.ndarray) -> float:
+    """Metres between a point (camera frame) and the plane."""
+    return float(abs(scene.T_camera_table[:3, 2] @ (point - scene.T_camera_table[:3, 3])))
 
 
 @pytest.mark.parametrize("plain", [True, False])
@@ -63,6 +74,19 @@ def test_the_true_pose_costs_least() -> None:
     best = cost_of(seen.scene, seen.poses["mug"], CostForm())
     for offset in 0.02 * np.eye(3):
         assert cost_of(seen.scene, pose(np.eye(3), offset) @ seen.poses["mug"], CostForm()) > 1.5 * best
+
+
+def test_the_floor_of_a_tray_pays_little_for_the_noise_of_the_plane_that_it_covers() -> None:
+    seen = render({"tray": upright("tray", 0.0, 0.0, 0.3)}, noise=0.002)
+    low = height_above(seen.scene.depth, seen.scene.view, seen.scene.T_camera_table) < 0.01
+    scene = ObservedScene.of(seen.scene.depth, seen.scene.foreground & ~low, K, seen.scene.T_camera_table)
+    x0, y0, x1, y1 = (int(value) for value in seen.boxes["tray"])
+    shape, part = Shape.of(CATALOGUE["tray"].mesh), (x0, y0, x1, y1)
+    window = Window.of(scene, scene.plane_inverse, part, part, stride=1, form=CostForm())
+    likelihood = ObjectLikelihood(shape, window, scene, CostForm())
+    (cost,) = likelihood.costs(seen.poses["tray"][None, :3])
+    floor = int((low & (scene.factor > 0))[y0:y1, x0:x1].sum())
+    assert cost < 0.5 * np.sqrt(2 / np.pi) * 0.002 * floor
 
 
 def test_invalid_depth_is_no_evidence() -> None:

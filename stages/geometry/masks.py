@@ -1,0 +1,29 @@
+"""Masks of images, H x W: grown, shrunk, freed of what is thin."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+
+
+def eroded(mask: Mask, radius: int) -> Mask:
+    """The mask without what lies within ``radius`` pixels of its border."""
+    return cv2.erode(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
+
+
+def dilated(mask: Mask, radius: int) -> Mask:
+    """The mask and what lies within ``radius`` pixels of it."""
+    return cv2.dilate(mask.astype(np.uint8), _disc(radius), borderValue=0).astype(bool)
+
+
+def opened(mask: Mask, radius: int) -> Mask:
+    """The mask without parts thinner than a disc; single missing readings do not tear it."""
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(1))
+    return cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(radius)).astype(bool) & mask
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
