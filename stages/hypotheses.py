@@ -107,10 +107,15 @@ class Hypotheses(Stage):
         known = max((each.log_weight for each in earlier), default=-np.inf)
         revised: list[Revision] = []
         if search and search.rounds < self.config.revisions and is_better(best.log_weight, known):
-            revised = revisions(best, search.offers)[: self.config.finalists]
+            # What else made the scene better was not in vain.
+            several = sum(is_better(each.log_weight, known) for each in posteriors) > 1
+            before = () if several else search.unexplained
+            revised = revisions(best, search.offers, before)[: self.config.finalists]
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained")
-            following = msgspec.structs.replace(search, earlier=contenders, rounds=search.rounds + 1)
+            following = msgspec.structs.replace(
+                search, earlier=contenders, rounds=search.rounds + 1, unexplained=best.unexplained
+            )
             yield from _revised(best, revised, following)
         for index, each in enumerate(() if revised else contenders):
             yield msgspec.structs.replace(each, index=index, count=len(contenders))

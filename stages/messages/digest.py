@@ -125,6 +125,8 @@ class Search(Struct, frozen=True, kw_only=True):
     """The hypotheses of the rounds before."""
     rounds: int = 0
     """How many these are."""
+    unexplained: tuple[float, ...] = ()
+    """Of each offer's box what the scene that the round revises leaves unexplained."""
 
 
 class Placed(Struct, frozen=True, kw_only=True):

@@ -13,6 +13,8 @@ from stages.messages.scene import ObjectPose
 
 _OPEN = 0.1
 """Share of what stands in a candidate's box from which on its object may be missing, or stand elsewhere."""
+_EQUAL = 0.01
+"""Difference of two such shares that is none."""
 _UNSEEN = 0.01
 """Visible share of an object up to which it explains nothing."""
 _GAIN = 0.01
@@ -29,24 +31,28 @@ class Revision:
     """Indices of offers, in the order in which they are looked for."""
 
 
-def revisions(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
+def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
     """Every revision of the best scene, the likelier kinds first.
 
-    An object that others hide wholly is left out; an offer comes in; it does, and an object in its way is looked for
-    again then; an object is looked for again; it is left out.
+    An object that others hide wholly is left out; an offer comes in; another object of the same kind does, for two of
+    which one hides most of the other may share a box; an offer comes in, and an object in its way is looked for again
+    then; an object is looked for again; it is left out. Where as much was unexplained ``before``, in the scene that the
+    last round revised, that was in vain.
     """
     everything = tuple(range(len(best.objects)))
     chosen = {_index(item, offers): i for i, item in enumerate(best.objects)}
     without = {k: tuple(j for j in everything if j != i) for k, i in chosen.items()}
     unseen = [k for k, i in chosen.items() if best.objects[i].visible < _UNSEEN]
     by_share = sorted(range(len(offers)), key=lambda k: -best.unexplained[k])
-    left_open = [k for k in by_share if best.unexplained[k] > _OPEN]
+    tried = [k for k, share in enumerate(before) if share > _OPEN and abs(best.unexplained[k] - share) < _EQUAL]
+    left_open = [k for k in by_share if best.unexplained[k] > _OPEN and k not in tried]
     missing = [k for k in left_open if k not in chosen]
     doubtful = [k for k in left_open if k in chosen]
     met = [(k, new) for k, new in product(doubtful, missing) if _meet(offers[k], offers[new])]
     return [
         *(Revision(without[k], ()) for k in unseen),
         *(Revision(everything, (new,)) for new in missing),
+        *(Revision(everything, (k,)) for k in doubtful),
         *(Revision(without[k], (new, k)) for k, new in met),
         *(Revision(without[k], (k,)) for k in doubtful),
         *(Revision(without[k], ()) for k in doubtful),
