@@ -50,6 +50,8 @@ _YAW_STEP = np.deg2rad(10.0)
 """Between the turns about a continuous axis at which an object is compared with the photograph."""
 _UPRIGHT = 0.9
 """Cosine of the angle to the vertical below which a turn would lay an upright object down."""
+_ON_ITS_HEAD = 2.0
+"""What it is less likely, in nats, that an object stands upside down: where little of it shows, nothing else may tell."""
 _FACING = np.deg2rad(15.0)
 """Turns within this show the same side."""
 
@@ -264,7 +266,8 @@ class _Joint:
         poses, odds = self._contenders(i, place)
         turns = self._models[i].turns if self._settings.colour else np.eye(4)[None]
         faced = _turned(poses, turns)
-        odds = odds[:, None] + self._colours(i, place, faced, rgb)
+        ups = faced[:, :, :3, 2] @ self._scene.T_camera_table[:3, 2]
+        odds = odds[:, None] + self._colours(i, place, faced, rgb) - _ON_ITS_HEAD * (ups < -_UPRIGHT)
         flip, turn = divmod(int(np.argmax(odds)), len(turns))
         shape_moved = not np.array_equal(poses[flip], self._poses[i])
         self._move(i, faced[flip, turn])
