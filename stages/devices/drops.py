@@ -17,6 +17,10 @@ from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh, Primitive
 _TIMESTEP = 0.004
 _SETTLE_STEPS = 350
 _REACH = 0.27  # Metres from the table's middle within which objects are dropped.
+_STACKED = 0.45
+"""Share of the objects that are put down on another one."""
+_COPIES = 1 / 3
+"""Share of the layouts in which there are equal objects."""
 _BOTH_WAYS = tuple(Rotation.from_rotvec([(0, 0, 0), (np.pi / 2, 0, 0)]).as_matrix())  # Standing and lying.
 
 
@@ -76,7 +80,8 @@ def _recoloured(thing: Thing, rng: np.random.Generator) -> Thing | None:
 
 
 def random_layout(known: Sequence[Thing], other: Sequence[Thing], rng: np.random.Generator) -> Layout:
-    """Up to nine known objects and three others, tidy or heaped, often on the widest known object (the tray)."""
+    """Up to nine known objects and three others, tidy or heaped, stacked in any order, often on the widest known object
+    (the tray); of some there are two or three."""
     chosen = _choose(known, other, rng)
     tidy = bool(rng.random() < 0.6)
     starts: list[Floats] = []
@@ -89,14 +94,20 @@ def random_layout(known: Sequence[Thing], other: Sequence[Thing], rng: np.random
 
 
 def _choose(known: Sequence[Thing], other: Sequence[Thing], rng: np.random.Generator) -> list[Thing]:
-    """Nothing known in 4 % of the layouts, else one to nine objects, rather more; others in half of them."""
+    """Nothing known in 4 % of the layouts, else one to nine objects, rather more; others in half of them.
+
+    In a third of them up to two objects are replaced by copies of another one.
+    """
     count = 0 if rng.random() < 0.04 else int(rng.integers(1, 10, 2).max())
     picked = [known[i] for i in rng.permutation(len(known))[:count]]
     widest = max(known, key=_width)
     if rng.random() < 0.6 and count and all(thing is not widest for thing in picked):
         picked[0] = widest
-    # The widest first, so that the rest lands on it rather than under it.
-    picked.sort(key=_width, reverse=True)
+    # The widest first, so that the rest lands on it rather than under it; of the rest anything may carry anything.
+    picked.sort(key=lambda thing: thing is not widest)
+    if rng.random() < _COPIES:
+        copies = picked[1:-1][: int(rng.integers(1, 3))]
+        picked[1 : 1 + len(copies)] = picked[-1:] * len(copies)
     strangers = [other[i] for i in rng.permutation(len(other))[: rng.integers(0, 4)]] if rng.random() < 0.5 else []
     return [*picked, *strangers]
 
@@ -133,7 +144,7 @@ def _rotation(thing: Thing, rng: np.random.Generator, *, tidy: bool) -> Floats:
 
 def _place(radius: float, occupied: list[tuple[Floats, float, float]], rng: np.random.Generator) -> Floats:
     """A spot on the table: free if one is found soon, or deliberately on an object that is there already."""
-    if occupied and rng.random() < 0.35:
+    if occupied and rng.random() < _STACKED:
         where, other, _ = occupied[rng.integers(len(occupied))]
         return where + rng.uniform(-0.5, 0.5, 2) * max(other - radius, 0.01)
     spots = rng.uniform(-_REACH, _REACH, (12, 2))

@@ -51,7 +51,7 @@ _YAW_STEP = np.deg2rad(10.0)
 _UPRIGHT = 0.9
 """Cosine of the angle to the vertical below which a turn would lay an upright object down."""
 _ON_ITS_HEAD = 2.0
-"""Nats by which an object is less likely to stand upside down: where little of it shows, nothing else may tell."""
+"""Nats by which it is less likely that an object stands upside down: where little of it shows, nothing else tells."""
 _FACING = np.deg2rad(15.0)
 """Turns within this show the same side."""
 

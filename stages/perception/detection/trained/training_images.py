@@ -21,7 +21,7 @@ from stages.scene.catalogue import Mesh
 Image = NDArray[np.uint8]
 DISTRACTOR = -1
 
-VISIBLE_SHARE = 0.25
+VISIBLE_SHARE = 0.1
 """An object of which less can be seen is neither demanded of the detector nor held against it."""
 _SMALLEST = 6  # Pixels; smaller boxes are ignored as well.
 _JPEG_QUALITY = 95
