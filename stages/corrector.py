@@ -26,7 +26,7 @@ from stages.robots import BUILT_IN, Robot, read_robot
 if TYPE_CHECKING:
     from stages.perception.correction.registration import Fit
 
-_CANDIDATES = 12
+_CANDIDATES = 20
 """Postures among which the most telling ones are chosen."""
 _FEWEST = 2
 """Postures without which nothing is said of the camera."""

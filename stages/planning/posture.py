@@ -12,7 +12,7 @@ from stages.geometry.camera import project
 from stages.geometry.poses import pose, random_rotations
 from stages.messages import Arrived, Outcome, PostureRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
-from stages.planning.collision import CollisionWorld
+from stages.planning.collision import AMPLE, CollisionWorld
 from stages.planning.motion import arm, free_motion, restarts, robot_command, solve_ik
 from stages.robots import Robot
 from stages.scene.catalogue import Primitive
@@ -22,12 +22,13 @@ _ABOVE = (0.10, 0.50)
 _UPWARDS = 0.3
 """Sine of the elevation beyond which the hand does not point."""
 _NEAREST = 0.45
-"""Metres from the camera at which depth cameras read."""
+"""Metres from the camera within which the hand is not."""
 _BORDER = 60
 """Pixels from the edge of the image within which the fingertips are not."""
 _DRAWS = 60
 """Places of the hand that are tried for each posture."""
-_CLEARANCE = 0.01
+_CLEARANCE = 0.002
+"""Metres that motions keep from everything; postures keep more, so that the arm that is a little off can leave them."""
 _BUMP = 7.0
 """Newtons at the hand that are a touch."""
 
@@ -35,14 +36,14 @@ Motion = Generator[RobotCommand, RobotState, Arrived]
 Homecoming = Generator[RobotCommand, RobotState, Outcome]
 
 
-def world_of(robot: Robot, request: PostureRequest) -> CollisionWorld:
+def world_of(robot: Robot, request: PostureRequest, *, clearance: float = AMPLE) -> CollisionWorld:
     """The robot, the table at its height, and what is occupied."""
     table = replace(robot.table, height=request.table_height)
     boxes = tuple(
         Primitive("box", tuple((high - low).tolist()), pose(np.eye(3), (low + high) / 2))
         for low, high in zip(request.occupied[:, :3], request.occupied[:, 3:], strict=True)
     )
-    return CollisionWorld(robot, table, {}, occupied=boxes, clearance=_CLEARANCE)
+    return CollisionWorld(robot, table, {}, occupied=boxes, clearance=clearance)
 
 
 def postures_in_view(world: CollisionWorld, rng: np.random.Generator, count: int) -> Iterator[Floats]:
@@ -81,14 +82,15 @@ class PostureRoutine:
         self, request: PostureRequest, *, robot: Robot, rng: np.random.Generator, log: Callable[[str], None]
     ) -> None:
         self._request, self._robot, self._rng, self._log = request, robot, rng, log
-        self._world = world_of(robot, request)
+        self._world = world_of(robot, request, clearance=_CLEARANCE)
 
     def run(self) -> Motion:
         """Commands to execute one after the other; each is answered by the encoders after it."""
         state = yield robot_command(self._robot, "read the encoders")
         started = state.time
         goal = self._request.positions
-        reason = f"no free motion: too close: {self._world.contacts(goal) or 'nothing'}"
+        close = self._world.contacts(arm(self._robot, state)) | self._world.contacts(goal)
+        reason = f"no free motion; too close: {close or 'nothing'}"
         path = None if state.stopped else free_motion(self._world, arm(self._robot, state), goal, self._rng)
         if path is not None:
             label = self._request.label

@@ -18,8 +18,12 @@ _ALIKE = 30.0
 """Neighbouring readings err together: so many count as one."""
 _COARSE = 4
 """Of which rows and columns every so manyth is rendered to say what a posture would show."""
+_NEAREST = 0.4
+"""Metres from the camera at which it begins to read."""
 _LEAST_EXPLAINED = 0.8
 """Share of the readings where the robot should be that must lie on it."""
+_LEAST_READ = 0.5
+"""Share of the robot's surface in the image that must be far enough to be read."""
 _SURPRISE = 4.0
 """Standard deviations of what was declared beyond which a correction is not believed."""
 
@@ -128,8 +132,12 @@ class Registration:
         """What a sight of the robot in this posture would tell of the seven numbers, 7 x 7."""
         view = self._view.sampled(0, 0, self._view.width, self._view.height, _COARSE)
         seen = self._surface.seen(posture.joint_names, posture.positions, posture.T_base_camera, view)
-        J = _change(seen.points, seen.normals)
-        return _COARSE**2 * (J * _weights(seen.points)[:, None]).T @ J
+        read = seen.points[:, 2] > _NEAREST
+        if not len(read) or read.mean() < _LEAST_READ:
+            return np.zeros((7, 7))  # What is right before the camera is not read, and hides the rest.
+        points = seen.points[read]
+        J = _change(points, seen.normals[read])
+        return _COARSE**2 * (J * _weights(points)[:, None]).T @ J
 
     def _doubt(self, explained: float, found: Floats) -> str:
         if explained < _LEAST_EXPLAINED:

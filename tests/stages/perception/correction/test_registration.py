@@ -88,7 +88,14 @@ def test_a_camera_that_is_farther_off_than_was_declared_is_refused() -> None:
 def test_the_most_telling_posture_comes_first() -> None:
     beside = posture(dict(zip(ROBOT.joint_names, _at_home(), strict=True)))
     order = list(registration().telling([beside, *postures()]))
-    assert order[:4] == [1, 2, 3, 4], "at home the arm is out of sight"
+    assert order[:3] == [1, 2, 3], "at home the arm is out of sight"
+
+
+def test_an_arm_right_before_the_camera_tells_nothing() -> None:
+    beyond = postures()[0]
+    back = pose(np.eye(3), np.array([0.0, 0.0, 0.5]))  # what was 0.6 to 0.9 m away is before the camera's first reading
+    near = Posture(beyond.joint_names, beyond.positions, beyond.T_base_camera @ back)
+    assert list(registration().telling([near, beyond])) == [1, 0]
 
 
 def _at_home() -> Floats:
