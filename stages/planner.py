@@ -122,9 +122,11 @@ class Planner(Stage):
         """One transfer, to a place on the table where the object hides nothing of what it hides now."""
         scene = Scene.of(task.current, self._stances)
         step = Step(task.aside, scene.supports[task.aside], TABLE)
-        workspace = replace(self._config.workspace, targets=_ASIDE).of(self._robot)
+        workspace = replace(self._config.workspace, targets=_ASIDE)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
-        poses = Targets(Placements(task.current, self._stances), workspace, handling, {}).of((step,), scene)
+        poses = Targets(Placements(task.current, self._stances), workspace, self._robot, handling, {}).of(
+            (step,), scene
+        )
         if isinstance(poses, Blocked | Crowded):
             return _answer("refused", "", reason=f"no room to put {task.aside} aside")
         item, T_table_base = scene.standing[task.aside], inverse(scene.T_base_table)
@@ -194,7 +196,7 @@ class Planner(Stage):
         current = Scene.of(task.current, self._stances)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
         placements = Placements(task.goal, self._stances)
-        targets = Targets(placements, self._config.workspace.of(self._robot), handling, wanted(task.goal))
+        targets = Targets(placements, self._config.workspace, self._robot, handling, wanted(task.goal))
         avoided = frozenset(task.avoid)
         because = ""
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)

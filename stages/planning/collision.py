@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import pose
+from stages.planning.kinematics import Chain
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Primitive
 
@@ -74,16 +74,7 @@ class CollisionWorld:
 
     def hand(self, q: Floats) -> Floats:
         """Forward kinematics: T_base_hand (4 x 4) at joint positions ``q`` (J)."""
-        self._data.qpos[self._q] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        return pose(self._data.xmat[self._hand].reshape(3, 3), self._data.xpos[self._hand])
-
-    def jacobian(self) -> Floats:
-        """6 x J: linear then angular velocity of the hand in the base frame, at the last :meth:`hand`."""
-        mujoco.mj_comPos(self._model, self._data)
-        linear, angular = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
-        mujoco.mj_jacBody(self._model, self._data, linear, angular, self._hand)
-        return np.vstack([linear[:, self._v], angular[:, self._v]])
+        return self.chain.hand(q)
 
     def is_free(self, q: Floats) -> bool:
         """True where joint positions ``q`` (J) keep the clearance."""
@@ -191,12 +182,11 @@ class CollisionWorld:
     def _index_robot(self) -> None:
         model, joints = self._model, [self._model.joint(name) for name in self.robot.joints]
         self._q = np.array([joint.qposadr[0] for joint in joints])
-        self._v = np.array([joint.dofadr[0] for joint in joints])
         self._fingers = np.array([model.joint(name).qposadr[0] for name in self.robot.gripper.posture(0.0)])
-        self._hand = model.body("hand frame").id
         # A joint without limits turns freely; half a turn either way reaches every angle.
         limits = [model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.pi, np.pi) for j in joints]
         self.lower, self.upper = np.array(limits).T
+        self.chain = Chain.of(model, self.robot.joints, "hand frame", self.robot.still, (self.lower, self.upper))
         for name, position in self.robot.still.items():
             self._data.joint(name).qpos[0] = position
 

@@ -21,16 +21,6 @@ from stages.geometry.poses import pose
 from stages.planning.collision import CollisionWorld, quaternion
 from stages.robots import Robot
 
-POSITION_TOLERANCE = 5e-4
-"""Metres per axis at which inverse kinematics is content."""
-ROTATION_TOLERANCE = 3e-3
-"""Radians per axis at which inverse kinematics is content."""
-
-_DAMPING = 1e-4
-_LARGEST_STEP = 0.4
-"""Radians that one joint may move in one step of inverse kinematics."""
-_PATIENCE, _PROGRESS = 10, 0.97
-"""Inverse kinematics gives up where so many steps leave more than this share of the error: out of reach."""
 _LARGEST_JUMP = 0.35
 """Radians between waypoints of a straight hand motion; more means a change of configuration."""
 _STRAIGHT_STEP = 0.01
@@ -75,10 +65,10 @@ def solve_ik(
 ) -> Floats | None:
     """Joint positions (J) that put the hand at ``T_base_hand``, from the first seed that leads there.
 
-    Damped least squares within the joint limits (Wampler 1986). With ``free``, solutions must be collision-free.
+    With ``free``, solutions must be collision-free.
     """
     for seed in seeds:
-        q = _descend(world, T_base_hand, seed, iterations)
+        q = world.chain.posture(T_base_hand, seed, iterations)
         if q is not None and (not free or world.is_free(q)):
             return q
     return None
@@ -168,25 +158,6 @@ def time_parameterise(robot: Robot, waypoints: Floats, *, speed: float = 0.7) ->
     timed = method.compute_trajectory(0, 0)
     times = np.append(np.arange(0, timed.duration, _SAMPLE_TIME), timed.duration)
     return Trajectory(times, timed(times), timed(times, 1))
-
-
-def _descend(world: CollisionWorld, target: Floats, seed: Floats, iterations: int) -> Floats | None:
-    q = np.clip(seed, world.lower, world.upper)
-    least = np.inf
-    for k in range(iterations):
-        error = _pose_error(world.hand(q), target)
-        if k % _PATIENCE == 0:
-            left = float(np.abs(error).max())
-            if left > _PROGRESS * least:
-                return None
-            least = left
-        if np.abs(error[:3]).max() < POSITION_TOLERANCE and np.abs(error[3:]).max() < ROTATION_TOLERANCE:
-            return q
-        J = world.jacobian()
-        step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
-        step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
-        q = np.clip(q + step, world.lower, world.upper)
-    return None
 
 
 def _pose_error(current: Floats, target: Floats) -> Floats:

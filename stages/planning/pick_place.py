@@ -35,7 +35,7 @@ _KEPT = 3
 """Feasible picks and places per grasp that are paired, and postures at which is looked for what is in the way."""
 _TRIED = 64
 """Hand poses per grasp that are tried for the place."""
-_EXAMINED, _TURNS = 8, 8
+_EXAMINED, _TURNS = 36, 8
 """Targets that are examined before anything moves, and hand poses per grasp at each."""
 _SUSPECTED = 12
 """Hand poses at which is looked for what is in the way."""

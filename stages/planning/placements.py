@@ -25,6 +25,8 @@ TURNED = 0.03
 """Cost of a quarter turn that the demonstration did not show, in metres of shift."""
 LAID = 0.05
 """Cost of leaving the object lying (or standing) as it is where the demonstration shows it otherwise."""
+_ANYWHERE = 1.0
+"""Metres from where it was shown within which an object may stand that only has to be on the table."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ class Placements:
         if step.region:
             reach, pitch = 0.6 * self._virtual[step.region].radius, 0.008
         elif step.destination == TABLE:
-            reach, pitch = 0.3, 0.01
+            reach, pitch = _ANYWHERE, 0.01
         else:
             size = np.ptp(scene.standing[step.destination].outline, axis=0)
             reach, pitch = 0.5 * float(size.max()), 0.01

@@ -35,9 +35,15 @@ CROWDED = 0.08
 """Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
 FAR = 0.1
 """Metres beyond which it does not matter how large a gap is exactly."""
+FARTHER = 0.03
+"""Metres beyond the robot's reach within which something may be placed if the hand gets there."""
+FEWEST = 4
+"""Poses offered for a transfer of which only late ones are within reach."""
 BRANCHES, TRIES = 4, 40
 """Places of one step from which is gone on, and how many in all before each step has but one."""
 
+BEYOND = 1.0
+"""Cost of a place outside the area in which the robot places: the hand may get there, as it does not everywhere."""
 ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
 """Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
 
@@ -60,7 +66,7 @@ class Workspace:
     """Gap that objects put aside should keep."""
     targets: int = 12
     """Poses offered for each transfer."""
-    considered: int = 500
+    considered: int = 2000
     """Poses considered for each transfer."""
 
     def __post_init__(self) -> None:
@@ -108,8 +114,18 @@ class Crowded:
     step: Step
 
 
-Options = tuple[list[Standing], "Handled"]
-"""Places for a step's object, and those among them that the hand reaches."""
+Found = tuple[list[Placement], tuple[str, ...]]
+"""Places that are free, best first, and the fewest objects that take up another one."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Places for a step's object, best first, and those among them that the hand reaches."""
+
+    places: list[Standing]
+    handled: Handled
+    obstacles: tuple[str, ...]
+    """The fewest objects that take up another place."""
 
 
 class Targets:
@@ -119,9 +135,12 @@ class Targets:
     because of an object that was placed before, that object's next place is tried.
     """
 
-    def __init__(self, placements: Placements, workspace: Workspace, handling: Handling, goal: dict[str, str]) -> None:
+    def __init__(
+        self, placements: Placements, workspace: Workspace, robot: Robot, handling: Handling, goal: dict[str, str]
+    ) -> None:
         """``goal`` maps the objects of the goal to what carries them."""
         self._placements, self._workspace, self._handling, self._goal = placements, workspace, handling, goal
+        self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
         self._tries = TRIES
 
@@ -139,22 +158,21 @@ class Targets:
         options = self._options(step, rest, scene, step in again)
         if isinstance(options, Blocked):
             return options
-        places, handled = options
-        failed = None
-        for number in islice(handled.places(), BRANCHES if self._tries > 0 else 1):
+        places, failed = options.places, None
+        for number in islice(options.handled.places(), BRANCHES if self._tries > 0 else 1):
             self._tries -= 1
             if step.item not in late and self._crowds(places[number], rest, scene):
                 return Crowded(step)
             onward = self.of(rest, scene.after(step.item, places[number], step.destination), again=again, late=late)
             if isinstance(onward, list):
-                best = places[number:][: self._workspace.targets]
+                best = places[number : max(self._workspace.targets, number + FEWEST)]
                 return [np.stack([scene.T_base_table @ item.T_table_object for item in best]), *onward]
             failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
                 break
         if failed is None:
-            why, obstacles = handled.why_not()
-            return Blocked(step, obstacles, why)
+            why, obstacles = options.handled.why_not()
+            return Blocked(step, obstacles or options.obstacles, why)
         return failed
 
     def _options(self, step: Step, rest: Sequence[Step], scene: Scene, again: bool) -> Options | Blocked:
@@ -164,25 +182,24 @@ class Targets:
         poses = tuple((item.name, item.T_table_stance.tobytes()) for item in scene.standing.values())
         key = (step, pending, frozenset(poses), again)
         if key not in self._known:
-            tried = self._goal_poses(step, scene) if final else self._free_spots(step, rest, scene)
-            if not isinstance(tried, Blocked):
-                places = [placement.standing for placement in sorted(tried, key=lambda placement: placement.cost)]
-                places = places[self._workspace.targets :] or places if again else places
-                tried = places, self._handling.of(step, scene, places)
-            self._known[key] = tried
+            found, obstacles = self._goal_poses(step, scene) if final else self._free_spots(step, rest, scene)
+            places = [placement.standing for placement in sorted(found, key=lambda placement: placement.cost)]
+            places = places[self._workspace.targets :] or places if again else places
+            handled = self._handling.of(step, scene, places) if places else None
+            self._known[key] = Options(places, handled, obstacles) if handled else Blocked(step, obstacles)
         return self._known[key]
 
     def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
         pending = {after.item for after in rest} - {item.name}
         return any(_clearance(item, scene.standing[name]) < CROWDED for name in pending)
 
-    def _goal_poses(self, step: Step, scene: Scene) -> list[Placement] | Blocked:
+    def _goal_poses(self, step: Step, scene: Scene) -> Found:
         """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle."""
         placements = self._placements.of(step, scene)
         placements = self._seen_first(placements, step, scene) if step.region else placements
         for margin in () if step.destination == TABLE else (self._workspace.clearance, 0.0):
             found = self._free(step, scene, placements, margin=margin)
-            if isinstance(found, list):
+            if found[0]:
                 return found
         return self._free(step, scene, placements, margin=None)
 
@@ -198,35 +215,40 @@ class Targets:
             sorted_again.append(Placement(one.standing, one.cost + hidden[place]))
         return sorted(sorted_again, key=lambda placement: placement.cost)
 
-    def _free(
-        self, step: Step, scene: Scene, placements: Sequence[Placement], *, margin: float | None
-    ) -> list[Placement] | Blocked:
+    def _free(self, step: Step, scene: Scene, placements: Sequence[Placement], *, margin: float | None) -> Found:
         """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
         others = scene.others(step.item, step.destination)
         valid: list[Placement] = []
+        beyond: list[Placement] = []
         blocking: list[tuple[str, ...]] = []
         supported = (p for p in placements if self._supported(p.standing, step.destination, scene, margin))
         for placement in islice(supported, self._workspace.considered):
-            if any(_alike(placement.standing, other.standing) for other in valid):
+            if any(_alike(placement.standing, other.standing) for other in (*valid, *beyond)):
                 continue
             item = scene.rested(placement.standing, step.destination)
             hit = tuple(other.name for other in others if _clearance(item, other) < self._workspace.clearance)
             if hit:
                 blocking.append(hit)
                 continue
-            outside = self._workspace.outside(scene.T_base_table @ item.T_table_object)
-            valid.append(Placement(item, placement.cost + 0.5 * outside))
+            outside = self._area.outside(scene.T_base_table @ item.T_table_object)
+            if outside > 0:
+                beyond.append(Placement(item, placement.cost + BEYOND + outside))
+                continue
+            valid.append(Placement(item, placement.cost))
             if len(valid) == 2 * self._workspace.targets:
                 break
-        return valid or Blocked(step, min(blocking, key=lambda hit: _effort(hit, scene), default=()))
+        obstacles = min(blocking, key=lambda hit: _effort(hit, scene), default=())
+        return valid + beyond[: self._workspace.targets], obstacles
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
         """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
 
-        The table always carries all of it, within reach of the arm.
+        The table always carries all of it, not far beyond where the arm is known to reach.
         """
         if destination == TABLE:
-            within_reach = self._workspace.outside(scene.T_base_table @ item.T_table_object) == 0
+            T_base_object = scene.T_base_table @ item.T_table_object
+            distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
+            within_reach = self._workspace.outside(T_base_object) == 0 and distance < self._robot.reach + FARTHER
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
@@ -241,7 +263,7 @@ class Targets:
         surface = scene.surface
         return surface is None or regions.inside(item.outline, surface, margin=self._workspace.edge)
 
-    def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> list[Placement] | Blocked:
+    def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
         """Places on the table, near and with space around them, where nothing of the goal will stand."""
         item = scene.standing[step.item]
         others = scene.others(step.item, TABLE)
@@ -261,11 +283,11 @@ class Targets:
             crowded = max(0.0, self._workspace.spacing - min(room, free))
             spots.append(Placement(spot, 0.2 * distance + 2 * crowded + _hidden(spot, others, scene)))
         spots.sort(key=lambda placement: placement.cost)
-        return spots[: 2 * self._workspace.targets] or Blocked(step, ())
+        return spots[: 2 * self._workspace.targets], ()
 
     def _grid(self, item: Standing, scene: Scene) -> list[Standing]:
         """The object as it is, on the table, at every 3 cm of the robot's area."""
-        (x0, x1), (y0, y1) = self._workspace.x, self._workspace.y
+        (x0, x1), (y0, y1) = self._area.x, self._area.y
         T_table_base = inverse(scene.T_base_table)
         spots: list[Standing] = []
         for x in np.arange(x0, x1, 0.03):

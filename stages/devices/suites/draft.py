@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from copy import copy
 
 import numpy as np
 
@@ -31,6 +32,10 @@ _BEYOND = 0.03
 _TRIES = 30
 _HIGHEST = 3
 """Objects in a stack."""
+_NOISE = 0.01
+"""Metres by which perception may find objects nearer to each other than they are."""
+_TURN = np.deg2rad(22.5)
+"""Between the turns of what is round at which is tried whether there is room beside it."""
 
 Shapes = Mapping[str, Stances]
 """How every object of a catalogue stands, by label."""
@@ -88,11 +93,11 @@ class Draft:
         R = yawed(yaw, np.zeros(3))[:3, :3] @ self._catalogue[label].resting[resting]
         T = np.eye(4)
         T[:3, :3], T[:2, 3] = R, place
-        item = Standing.at(name, self._shapes[label], T)
+        item = self._at(name, T)
         if not self._is_carried(item, support):
             return False
         T[2, 3] = self._height(support, item.bottom) - item.stance.low
-        item = Standing.at(name, self._shapes[label], T)
+        item = self._at(name, T)
         if not self._is_apart(item, support, apart):
             return False
         self.placed[name], self.supports[name] = item, support
@@ -105,21 +110,51 @@ class Draft:
         """What may carry one thing more: hollows, and flat tops on which nothing stands and that are not too high."""
         return [name for name, item in self.placed.items() if item.stance.cavity or self._is_free_top(item)]
 
-    def has_room_beside(self, goal: Draft) -> bool:
-        """Whether what stands beside something in ``goal`` that the hand cannot take would have room there here."""
-        for name, fixed in self.placed.items():
-            if fixed.stance.item.grasps or name not in goal.placed:
-                continue
-            there = goal.placed[name]
-            T = fixed.T_table_object @ inverse(there.T_table_object)
-            beside = (
-                Standing.at(other.name, self._shapes[label_of(other.name, self._catalogue)], T @ other.T_table_object)
-                for other in goal.placed.values()
-                if goal.supports[other.name] == TABLE and regions.gap(other.outline, there.outline) < BESIDE
-            )
-            if not all(self._is_carried(item, TABLE) for item in beside if item.name != name):
-                return False
-        return True
+    def moved_with(self, start: Draft) -> Iterator[Draft]:
+        """What stands in, on and beside an object that the hand cannot take, where that object is at the ``start``.
+
+        Once for each of its symmetries with which all of that is on the table; once, and empty, where there is none.
+        """
+        fixed = next((name for name, item in self.placed.items() if not item.stance.item.grasps), "")
+        if fixed not in start.placed:
+            yield self._with({}, start)
+            return
+        names = self._around(fixed)
+        there, here = start.placed[fixed], inverse(self.placed[fixed].T_table_object)
+        for turn in there.stance.item.symmetries.transforms(_TURN):
+            T = there.T_table_object @ turn @ here
+            placed = {
+                name: self._at(name, T @ item.T_table_object) for name, item in self.placed.items() if name in names
+            }
+            if all(self._is_carried(item, TABLE) for item in placed.values() if self.supports[item.name] == TABLE):
+                yield self._with(placed, start)
+
+    def _with(self, placed: dict[str, Standing], start: Draft) -> Draft:
+        """The same with other objects, on the table of ``start``."""
+        draft = copy(start)
+        draft.placed, draft.supports = placed, {name: self.supports[name] for name in placed}
+        return draft
+
+    def _around(self, name: str) -> set[str]:
+        """An object, what it carries, what stands beside it, and so on."""
+        found, pending = {name}, [name]
+        while pending:
+            one = pending.pop()
+            new = {
+                other.name
+                for other in self.placed.values()
+                if self.supports[other.name] == one
+                or (
+                    self.supports[other.name] == self.supports[one]
+                    and regions.gap(other.outline, self.placed[one].outline) < BESIDE + _NOISE
+                )
+            } - found
+            found |= new
+            pending += sorted(new)
+        return found
+
+    def _at(self, name: str, T_base_object: Floats) -> Standing:
+        return Standing.at(name, self._shapes[label_of(name, self._catalogue)], T_base_object)
 
     def _take_away(self, name: str) -> None:
         self.placed.pop(name, None)

@@ -90,8 +90,10 @@ class Drawn(Suite):
             raise Rejected("out of reach")
         if kind == "goal":
             self._goal = draft
-        elif self._goal is not None and not self._goal.has_room_beside(draft):
-            raise Rejected("no room beside what cannot be moved")
+        elif self._goal is not None and all(
+            stuck(self.robot, there.placed, there.supports, self.table) for there in self._goal.moved_with(draft)
+        ):
+            raise Rejected("the goal is out of reach around what cannot be moved")
         return draft.layout
 
 

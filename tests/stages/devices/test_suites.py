@@ -152,8 +152,11 @@ def test_what_belongs_beside_the_tray_needs_room_there() -> None:
     goal = draft(0.7, 0.0)
     depth = np.ptp(goal.placed["tray"].outline[:, 0])
     assert goal.put_at("salt_shaker", "table", np.array([0.7 - depth / 2 - 0.04, 0.0]), 0.0)
-    assert draft(0.7, 0.1).has_room_beside(goal)
-    assert not draft(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0).has_room_beside(goal)
+    there = next(goal.moved_with(draft(0.7, 0.1)))
+    assert there.placed.keys() == {"tray", "salt_shaker"}
+    assert not stuck(ROBOT, there.placed, there.supports, TABLE)
+    at_the_edge = draft(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0)
+    assert all(stuck(ROBOT, one.placed, one.supports, TABLE) for one in goal.moved_with(at_the_edge))
 
 
 def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
