@@ -183,7 +183,15 @@ class Robot:
         return answer
 
 
-_NO_OBSERVATION: Observation = None  # pyright: ignore[reportAssignmentType]
+_NO_OBSERVATION = Observation(
+    depth=np.zeros((1, 1), np.float32),
+    rgb=np.zeros((1, 1, 3), np.uint8),
+    foreground=np.zeros((1, 1), np.bool_),
+    K=_K,
+    T_camera_table=np.eye(4),
+    T_base_camera=None,
+)
+"""Shows nothing, so that nothing is remembered either: every look says where everything is."""
 
 
 def _messages(answer: Any) -> Iterator[Message]:

@@ -117,3 +117,10 @@ def cube_rotations() -> Floats:
             if not any(np.array_equal(candidate, known) for known in found):
                 found.append(candidate)
     return np.stack(found)
+
+
+def raised(T: Floats, height: float) -> Floats:
+    """The same pose ``height`` metres higher."""
+    result = T.copy()
+    result[2, 3] += height
+    return result

@@ -101,7 +101,7 @@ def separation(a: Region, b: Region) -> float:
 
 def _beyond(region: Region, other: Region) -> float:
     """How far all of ``other`` lies beyond the edge of ``region`` that separates them best; negative if none does."""
-    along = np.roll(region, -1, axis=0) - region
+    along = np.concatenate([region[1:], region[:1]]) - region
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
     return float(((outward @ other.T).min(1) - (outward * region).sum(1)).max())
 

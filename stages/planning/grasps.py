@@ -7,12 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import raised
 from stages.scene.catalogue import CatalogueObject, Grasp
 
 _STEP = np.deg2rad(22.5)
 """How finely a continuous symmetry is sampled."""
 _STEEPEST = 0.2
 """Largest vertical component of an approach direction: nothing is grasped from below."""
+
+
+_ABOVE = 0.12
+"""Metres above a side grasp from which the open fingers may come down on either side of the object."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,14 @@ def hand_poses(entry: CatalogueObject, grasp: Grasp, T_base_object: Floats) -> l
     """
     poses = [pose for pose in _all_poses(entry, grasp, T_base_object) if pose.T_base_hand[2, 0] <= _STEEPEST]
     return _distinct(sorted(poses, key=lambda pose: -_outward(pose)))
+
+
+def approaches(hand: HandPose) -> list[Floats]:
+    """Where the hand may come from in a straight line, 4 x 4 each: as the catalogue says, from nearer, from above."""
+    near = hand.T_base_prehand.copy()
+    near[:3, 3] = (hand.T_base_prehand[:3, 3] + hand.T_base_hand[:3, 3]) / 2
+    above = raised(hand.T_base_hand, _ABOVE)
+    return [hand.T_base_prehand, near, above] if hand.grasp.kind == "side" else [hand.T_base_prehand, near]
 
 
 def _all_poses(entry: CatalogueObject, grasp: Grasp, T_base_object: Floats) -> list[HandPose]:

@@ -8,18 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from stages.planning.collision import CollisionWorld
-from stages.planning.pick_place import Errand, PickPlacePlanner
+from stages.planning.pick_place import MARGINS, Errand, PickPlacePlanner
 from stages.planning.placements import Scene
 from stages.planning.search import Step
 from stages.robots import Robot, Table
 from stages.scene.stance import Standing
 
-CLEARANCE = 0.002
-"""Metres that the hand keeps from everything: the least that a transfer is carried out with."""
-
 
 class Handling:
-    """Grasps, postures and straight motions of single steps, as the executor will look for them."""
+    """Grasps, postures and straight motions of single steps, with the least margins that a transfer is done with."""
 
     def __init__(self, robot: Robot, table: Table, rng: np.random.Generator) -> None:
         self._robot, self._table, self._rng = robot, table, rng
@@ -30,10 +27,10 @@ class Handling:
             name: (item.stance.item, scene.T_base_table @ item.T_table_object) for name, item in scene.standing.items()
         }
         table = replace(self._table, height=float(scene.T_base_table[2, 3]))
-        world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=CLEARANCE)
+        world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=MARGINS[-1].clearance)
         targets = np.stack([scene.T_base_table @ place.T_table_object for place in places])
         errand = Errand(*objects[step.item], targets, step.source, step.destination)
-        return Handled(PickPlacePlanner(world, errand, self._rng), self._robot)
+        return Handled(PickPlacePlanner(world, errand, self._rng, room=MARGINS[-1].room), self._robot)
 
 
 class Handled:

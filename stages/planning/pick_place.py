@@ -6,15 +6,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice, product
+from itertools import chain, islice, product
 
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, raised
 from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
-from stages.planning.grasps import HandPose, distinct_grasps, hand_poses
+from stages.planning.grasps import HandPose, approaches, distinct_grasps, hand_poses
 from stages.planning.motion import free_motion, restarts, solve_ik, straight_motion
 from stages.scene.catalogue import CatalogueObject, Grasp
 
@@ -24,10 +24,8 @@ ABOVE = 0.10
 """Metres above its target from which an object is lowered."""
 HOVER = 0.008
 """Metres above its target where lowering becomes guarded: below, the support's estimated height is not trusted."""
-ROOM = 0.012
-"""Metres between object and finger on each side before closing: room for errors of the estimated pose."""
 RELEASE = 0.010
-"""Metres that each finger opens to let go."""
+"""Metres that each finger opens to let go, where there is room."""
 
 _RESTARTS = 12
 """Random postures from which inverse kinematics starts: near the robot, few of them lead to a free one."""
@@ -42,10 +40,26 @@ _SUSPECTED = 12
 
 
 @dataclass(frozen=True)
+class Margins:
+    """Metres that the hand keeps for errors of what is estimated."""
+
+    clearance: float
+    """From everything but what it holds."""
+    room: float
+    """Between an object and the finger on either side of it, before they close and after they have let go."""
+
+
+MARGINS = (Margins(0.015, 0.012), Margins(0.006, 0.012), Margins(0.002, 0.006))
+"""As much as an uncalibrated camera is off is looked for first; the last is the least with which anything is done."""
+
+
+@dataclass(frozen=True)
 class Pick:
     """Joint motions (W x J) from the pre-grasp to the grasp and from there up, with the object."""
 
     hand: HandPose
+    width: float
+    """Metres between the fingers on the way to the grasp."""
     approach: Floats
     lift: Floats
 
@@ -87,18 +101,12 @@ def opening(world: CollisionWorld, grasp: Grasp, room: float) -> float:
     return min(grasp.width + 2 * room, world.robot.gripper.open_width)
 
 
-def raised(T_base_hand: Floats, height: float) -> Floats:
-    """The same pose ``height`` metres higher."""
-    result = T_base_hand.copy()
-    result[2, 3] += height
-    return result
-
-
 class PickPlacePlanner:
     """Searches grasps in the user's order; ``obstacle`` tells how far the search came."""
 
-    def __init__(self, world: CollisionWorld, errand: Errand, rng: np.random.Generator) -> None:
-        self._world, self._errand, self._rng = world, errand, rng
+    def __init__(self, world: CollisionWorld, errand: Errand, rng: np.random.Generator, *, room: float) -> None:
+        """``room``: see :class:`Margins`."""
+        self._world, self._errand, self._rng, self._room = world, errand, rng, room
         self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
         self._is_picked = False
 
@@ -108,6 +116,10 @@ class PickPlacePlanner:
             picks = list(islice(self._picks(grasp, start), _KEPT))
             places = list(islice(self._places(grasp, picks[0].lift[-1]), _KEPT)) if picks else []
             yield from self._connected(product(picks, places), start)
+
+    def can_pick(self, start: Floats) -> bool:
+        """Whether any grasp takes the object where it is and lifts it; the arm begins at joint positions ``start``."""
+        return any(next(self._picks(grasp, start), None) for grasp in distinct_grasps(self._errand.entry))
 
     def reachable(self, start: Floats) -> Iterator[int]:
         """Targets by number, best first, to which a grasp leads from where the object is.
@@ -144,7 +156,7 @@ class PickPlacePlanner:
     def _touched(self, hand: HandPose, start: Floats) -> tuple[str, ...]:
         """Objects too near the hand or what it holds; none where it is not reached or something else is too near."""
         world = self._world
-        world.set_width(opening(world, hand.grasp, ROOM))
+        world.set_width(opening(world, hand.grasp, self._room))
         placing = [self.holding(hand), world.resting(self._errand.destination)]
         before = raised(hand.T_base_hand, ABOVE) if self._is_picked else hand.T_base_prehand
         with ExitStack() as stack:
@@ -167,7 +179,7 @@ class PickPlacePlanner:
     def _connected(self, pairs: Iterable[tuple[Pick, Place]], start: Floats) -> Iterator[PickPlace]:
         """Joins picks and places by motions in joint space."""
         for pick, place in pairs:
-            self._world.set_width(opening(self._world, pick.hand.grasp, ROOM))
+            self._world.set_width(pick.width)
             reach = free_motion(self._world, start, pick.approach[0], self._rng)
             if reach is None:
                 self._note("pick motion", "no free motion to the pre-grasp")
@@ -186,11 +198,11 @@ class PickPlacePlanner:
                 yield pick
 
     def _pick(self, hand: HandPose, start: Floats) -> Pick | None:
-        """The first posture before the grasp from which straight motions lead to it and up."""
-        world = self._world
+        """The first posture before the grasp from which straight motions lead to it, and up from there."""
+        world, width = self._world, opening(self._world, hand.grasp, self._room)
         self._note("ik", "no grasp of it is reachable without a collision")
-        for pregrasp in self._postures(hand.T_base_prehand, start):
-            world.set_width(opening(world, hand.grasp, ROOM))
+        for pregrasp in chain.from_iterable(self._postures(before, start) for before in approaches(hand)):
+            world.set_width(width)
             if not world.is_free(pregrasp):
                 continue
             with world.touching(world.carried):
@@ -203,7 +215,7 @@ class PickPlacePlanner:
                 lifts = (straight_motion(world, approach[-1], T) for T in heights)
                 lift = next((found for found in lifts if found is not None), None)
             if lift is not None:
-                return Pick(hand, approach, lift)
+                return Pick(hand, width, approach, lift)
             self._note("pick motion", "no way to lift it")
         return None
 
@@ -242,10 +254,16 @@ class PickPlacePlanner:
 
     def retreat(self, hand: HandPose, q: Floats) -> Floats | None:
         """Motion (W x J) of the open hand from joint positions ``q`` out of a place at ``hand``."""
-        self._world.set_width(opening(self._world, hand.grasp, RELEASE))
-        backwards = self._world.hand(q) @ inverse(hand.T_base_hand) @ hand.T_base_prehand
+        self._world.set_width(opening(self._world, hand.grasp, self.release))
+        off = self._world.hand(q) @ inverse(hand.T_base_hand)
         with self._world.touching(self._world.carried):
-            return straight_motion(self._world, q, backwards)
+            ways = (straight_motion(self._world, q, off @ before) for before in approaches(hand))
+            return next((way for way in ways if way is not None), None)
+
+    @property
+    def release(self) -> float:
+        """Metres that each finger opens to let go."""
+        return min(RELEASE, self._room)
 
     def holding(self, hand: HandPose) -> AbstractContextManager[None]:
         """While it lasts, the object is in the hand as at ``hand``."""

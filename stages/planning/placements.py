@@ -101,6 +101,8 @@ class Placements:
         item = scene.standing[step.item]
         stances = self._stances[self._labels[step.item]]
         nominal = self._nominal(step, scene)
+        shown = self._as_shown(step, scene) if step.region else nominal[0][:2, 3]
+        nominal.sort(key=lambda T: float(np.linalg.norm(T[:2, 3] - shown)))
         shifts = list(self._shifts(step, scene))
         made: list[Placement] = []
         for k, T in enumerate(nominal):
@@ -134,6 +136,17 @@ class Placements:
         upright = poses[:, 2, :3] @ self._shown(step.item)[2, :3] > np.cos(ALIGNED)
         kept = list(poses[upright])
         return kept[:: -(-len(kept) // RING)] if kept else [self._centred(step, scene)]
+
+    def _as_shown(self, step: Step, scene: Scene) -> Floats:
+        """Where (x, y) a region was shown to be beside its parent, in the frame of what carries both.
+
+        Of places around a symmetric parent that is the one for which the others left room.
+        """
+        away = self._shown(step.item)[:3, 3] - self._shown(step.parent)[:3, 3]
+        if step.destination != TABLE:
+            now, then = (one.standing[step.destination].T_table_object[:3, :3] for one in (scene, self._goal))
+            away = now @ then.T @ away
+        return (scene.standing[step.parent].T_table_object[:3, 3] + away)[:2]
 
     def _shown(self, name: str) -> Floats:
         """The pose in the goal scene's table frame."""

@@ -191,17 +191,21 @@ class Targets:
 
     def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
         pending = {after.item for after in rest} - {item.name}
-        return any(_clearance(item, scene.standing[name]) < CROWDED for name in pending)
+        return any(_is_near(item, scene.standing[name], CROWDED) for name in pending)
 
     def _goal_poses(self, step: Step, scene: Scene) -> Found:
         """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle."""
         placements = self._placements.of(step, scene)
         placements = self._seen_first(placements, step, scene) if step.region else placements
-        for margin in () if step.destination == TABLE else (self._workspace.clearance, 0.0):
+        margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
+        if step.destination != TABLE and _fits(scene.standing[step.item], scene.standing[step.destination]):
+            margins = margins[:2]
+        found: Found = [], ()
+        for margin in margins:
             found = self._free(step, scene, placements, margin=margin)
             if found[0]:
-                return found
-        return self._free(step, scene, placements, margin=None)
+                break
+        return found
 
     def _seen_first(self, placements: Sequence[Placement], step: Step, scene: Scene) -> list[Placement]:
         """Sorted again: of the places that look alike around a symmetric parent those come later that are hidden."""
@@ -226,7 +230,7 @@ class Targets:
             if any(_alike(placement.standing, other.standing) for other in (*valid, *beyond)):
                 continue
             item = scene.rested(placement.standing, step.destination)
-            hit = tuple(other.name for other in others if _clearance(item, other) < self._workspace.clearance)
+            hit = tuple(other.name for other in others if _is_near(item, other, self._workspace.clearance))
             if hit:
                 blocking.append(hit)
                 continue
@@ -298,6 +302,14 @@ class Targets:
         return spots
 
 
+def _fits(item: Standing, carrier: Standing) -> bool:
+    """Whether the object finds room on the floor of a hollow, so that it need not lean on its wall."""
+    if carrier.stance.cavity is None:
+        return False
+    middle = regions.centroid(carrier.floor) - regions.centroid(item.bottom)
+    return regions.inside(item.bottom + middle, carrier.floor)
+
+
 def neighbours(name: str, scene: Scene) -> list[str]:
     """The objects that stand in the way of a hand that picks one, nearest first."""
     item = scene.standing[name]
@@ -307,8 +319,9 @@ def neighbours(name: str, scene: Scene) -> list[str]:
 
 def _alike(a: Standing, b: Standing) -> bool:
     """Whether two poses of an object differ so little that the arm reaches both or none."""
-    turn = a.T_table_object[:3, :3].ravel() @ b.T_table_object[:3, :3].ravel()
-    return bool(np.linalg.norm((a.T_table_stance - b.T_table_stance)[:2, 3]) < ALIKE[0] and turn > ALIKE[1])
+    if _distance(a, b) >= ALIKE[0]:
+        return False
+    return bool(a.T_table_object[:3, :3].ravel() @ b.T_table_object[:3, :3].ravel() > ALIKE[1])
 
 
 def _effort(obstacles: tuple[str, ...], scene: Scene) -> tuple[int, int]:
@@ -324,8 +337,19 @@ def _clearance(a: Standing, b: Standing) -> float:
     """
     if a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING:
         return np.inf
-    between = hypot(*(a.T_table_stance[:2, 3] - b.T_table_stance[:2, 3])) - a.stance.radius - b.stance.radius
+    between = _distance(a, b) - a.stance.radius - b.stance.radius
     return between if between > FAR else regions.separation(a.outline, b.outline)
+
+
+def _is_near(a: Standing, b: Standing, metres: float) -> bool:
+    """Whether the gap between footprints is less than that; asked often, and answered by the circles where these do."""
+    return _distance(a, b) - a.stance.radius - b.stance.radius < metres and _clearance(a, b) < metres
+
+
+def _distance(a: Standing, b: Standing) -> float:
+    """Between the origins, seen from above, metres."""
+    A, B = a.T_table_stance, b.T_table_stance
+    return hypot(A[0, 3] - B[0, 3], A[1, 3] - B[1, 3])
 
 
 def _hidden(item: Standing, others: Sequence[Standing], scene: Scene) -> float:

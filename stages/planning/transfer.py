@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, raised
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
@@ -20,15 +20,12 @@ from stages.planning.motion import FAST, arm, free_motion, robot_command, straig
 from stages.planning.pick_place import (
     HOVER,
     LIFT,
-    RELEASE,
-    ROOM,
+    MARGINS,
     Errand,
     Pick,
     PickPlace,
     PickPlacePlanner,
     Place,
-    opening,
-    raised,
 )
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
@@ -37,8 +34,6 @@ Routine = Generator[RobotCommand, RobotState, "Outcome"]
 Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]
 """Yields commands, receives encoders, returns the failed stage ("" for success) and the reason."""
 
-_CLEARANCES = (0.015, 0.006, 0.002)
-"""Metres: a plan with ample clearance, as much as an uncalibrated camera is off, is looked for first."""
 _SLOW = 0.4
 """Share of the joint limits for motions next to objects."""
 _LOWERING_STEP = 0.002
@@ -56,6 +51,8 @@ _ASIDE = 0.012
 """Metres by which the hand evades to either side when a finger comes down on the object: as much as there is room."""
 _RUB = 15.0
 """Newtons that do not matter where the hand leaves what it has let go of."""
+_WIDER = 0.012
+"""Metres by which the fingers may stand wider on an object than it is."""
 _EMPTY = 0.003
 """Metres beyond closed up to which nothing is between the fingers."""
 _G = 9.81
@@ -174,7 +171,7 @@ class TransferRoutine:
         """From wherever the arm stands: what is held goes back to where it was taken from, the hand goes home."""
         at, q = self._under_way, self._arm(state)
         if at is None:
-            return (yield from self._home(self._world(_CLEARANCES[-1]), q))
+            return (yield from self._home(self._world(MARGINS[-1].clearance), q))
         if self.in_hand:
             state = yield from self._do("feel what is in the hand", width=0.0)
             if state.gripper_width > self._robot.gripper.closed_width + _EMPTY:
@@ -198,20 +195,22 @@ class TransferRoutine:
             return "release", f"no free way back; in the hand: {at.world.carried}"
         yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
         yield from self._do(f"carry {at.world.carried} back", carry)
-        # Straight down the way it came, but for the last waypoint: from there on it is felt for.
-        return (yield from self._put_down(at, Place(pick.hand, pick.lift[:0:-1]), guard=None))
+        # Straight down the way it came, but for the last waypoint: from there on it is felt for. What has slid in the
+        # hand hangs lower by nobody knows how much.
+        place, guard = Place(pick.hand, pick.lift[:0:-1]), Guard(force=_TOUCH + self._weight)
+        return (yield from self._put_down(at, place, guard=guard, early=LIFT))
 
     def _go_home_first(self, state: RobotState) -> Steps:
         q = self._arm(state)
         if np.abs(q - self._robot.home).max() < _AWAY:
             return "", ""
-        return (yield from self._home(self._world(_CLEARANCES[-1]), q))
+        return (yield from self._home(self._world(MARGINS[-1].clearance), q))
 
     def _try_plans(self) -> Steps:
         failure: tuple[FailedStage, str] = ("ik", "")
-        for clearance in _CLEARANCES:
-            world = self._world(clearance)
-            planner = PickPlacePlanner(world, self._errand(), self._rng)
+        for margins in MARGINS:
+            world = self._world(margins.clearance)
+            planner = PickPlacePlanner(world, self._errand(), self._rng, room=margins.room)
             for plan in self._timed(planner.plans(self._robot.home)):
                 self._under_way = _UnderWay(world, planner, plan)
                 failure = yield from self._execute(self._under_way)
@@ -225,7 +224,7 @@ class TransferRoutine:
         world, plan, grasp = at.world, at.plan, at.plan.pick.hand.grasp
         self._tally.attempts += 1
         self._tally.grasp = grasp.name
-        yield from self._do("open the hand", width=opening(world, grasp, ROOM))
+        yield from self._do("open the hand", width=plan.pick.width)
         yield from self._do(f"reach for {world.carried}", plan.reach, guard=Guard(force=_BUMP))
         state, lift = yield from self._take(world, plan.pick)
         if not self._is_held(state, grasp):
@@ -235,9 +234,9 @@ class TransferRoutine:
         narrowest, widest = self._held_between(grasp)
         lifting = Guard(narrowest=narrowest, widest=widest)
         yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
-        weight = _G * self._objects[world.carried][0].mass
-        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + weight))
-        return (yield from self._put_down(at, plan.place, guard=replace(lifting, force=_TOUCH + weight)))
+        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + self._weight))
+        guard = replace(lifting, force=_TOUCH + self._weight)
+        return (yield from self._put_down(at, plan.place, guard=guard, early=_EARLY))
 
     def _take(
         self, world: CollisionWorld, pick: Pick
@@ -269,9 +268,9 @@ class TransferRoutine:
         for metres in (_ASIDE, -_ASIDE):
             shift = np.eye(4)
             shift[1, 3] = metres
-            world.set_width(opening(world, hand.grasp, ROOM))
+            world.set_width(pick.width)
             with world.touching(world.carried):
-                beside = straight_motion(world, pick.approach[0], hand.T_base_prehand @ shift)
+                beside = straight_motion(world, pick.approach[0], world.hand(pick.approach[0]) @ shift)
                 down = None if beside is None else straight_motion(world, beside[-1], hand.T_base_hand @ shift)
             if beside is None or down is None:
                 continue
@@ -290,7 +289,13 @@ class TransferRoutine:
         failure = yield from self._home(world, plan.pick.approach[0])
         return failure if failure[0] else ("grasp", reason)
 
-    def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard | None) -> Steps:
+    @property
+    def _weight(self) -> float:
+        """Of the object, as far as it is known, newtons."""
+        return _G * self._objects[self._request.transfer.object][0].mass
+
+    def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard, early: float) -> Steps:
+        """A touch less than ``early`` metres above the target is the support."""
         world = at.world
         try:
             state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
@@ -299,10 +304,10 @@ class TransferRoutine:
             # What is held by its rim hangs lower than it was lifted.
             state, q, felt = broken.state, self._arm(broken.state), True
             height = world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3]
-            if state.stopped != "touch" or height > _EARLY:
+            if state.stopped != "touch" or height > early:
                 raise
         held = state.gripper_width
-        wanted = min(held + 2 * RELEASE, self._robot.gripper.open_width)
+        wanted = min(held + 2 * at.planner.release, self._robot.gripper.open_width)
         state = yield from self._do(f"let go of {world.carried}", width=wanted)
         self.in_hand = ""
         left = world.hand(q) @ inverse(at.plan.pick.hand.T_object_hand)
@@ -386,7 +391,7 @@ class TransferRoutine:
     def _held_between(self, grasp: Grasp) -> tuple[float, float]:
         """Metres between the fingers while they hold the object, at least and at most."""
         shut = self._robot.gripper.closed_width
-        return shut + 0.5 * (grasp.width - shut), grasp.width + ROOM
+        return shut + 0.5 * (grasp.width - shut), grasp.width + _WIDER
 
     def _lag(self, world: CollisionWorld, q: Floats, state: RobotState) -> float:
         """Metres that the hand is higher than commanded."""

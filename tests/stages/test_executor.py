@@ -299,17 +299,17 @@ def test_what_is_not_quite_where_it_was_seen_is_grasped_beside_that() -> None:
 
 
 def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> None:
-    bench = Bench(0, "tea")
+    bench = Bench(0, "breakfast")
     before = bench.poses()
-    seen = {name: T for name, T in before.items() if name != "sugar_box"}
-    x, y = before["sugar_box"][:2, 3]
+    seen = {name: T for name, T in before.items() if name != "tea_box"}
+    x, y = before["tea_box"][:2, 3]
     outcome = bench.transfer(seen, "cup", "table", standing("cup", x, y))
     assert (outcome.success, outcome.failed_stage) == (False, "touch")
     assert "N at the hand" in outcome.reason
     assert bench.is_home()
     after = bench.poses()
     assert np.linalg.norm(after["cup"][:3, 3] - before["cup"][:3, 3]) < 0.02
-    assert after["sugar_box"][2, 2] > 0.99
+    assert after["tea_box"][2, 2] > 0.99
 
 
 def test_states_between_transfers_are_ignored() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from copy import copy
+from types import MappingProxyType
 
 import numpy as np
 
@@ -58,10 +59,14 @@ class Draft:
         robot: Robot,
         table: Table,
         hidden: float,
+        stay: Mapping[str, Standing] = MappingProxyType({}),
     ) -> None:
-        """``hidden``: the largest share of an object that others may hide from the camera."""
+        """``hidden``: the largest share of an object that others may hide from the camera.
+
+        What is to ``stay`` is put down where it is there, if it is put on the table.
+        """
         self._catalogue, self._shapes, self._rng, self._robot = catalogue, shapes, rng, robot
-        self._table, self._hidden = table, hidden
+        self._table, self._hidden, self._stay = table, hidden, stay
         low, high = (np.array(table.center) + side * np.array(table.size) / 2 for side in (-1, 1))
         self._surface = regions.rectangle(low.tolist(), high.tolist())
         self.placed: dict[str, Standing] = {}
@@ -76,6 +81,9 @@ class Draft:
         self, name: str, support: str = TABLE, *, near: str = "", apart: float = APART, resting: int = 0
     ) -> bool:  # fmt: skip
         """Puts an object on or in ``support`` (beside ``near``) in one of its resting poses; False where none fits."""
+        if name in self._stay and support == TABLE:
+            T = self._stay[name].T_table_stance
+            return self.put_at(name, support, T[:2, 3], float(np.arctan2(T[1, 0], T[0, 0])), apart=apart)
         for _ in range(_TRIES):
             place = self._place(support, near)
             if self.put_at(name, support, place, self._rng.uniform(-np.pi, np.pi), apart=apart, resting=resting) and (

@@ -15,12 +15,17 @@ from stages.devices.tabletop import HIDDEN, Layout
 from stages.geometry.arrays import Floats
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
+from stages.scene.stance import Standing
 
 Kind = Literal["goal", "start"]
 
 
 _MIDDLE = (0.80, 0.0, 0.70)
 """Where the numbers of the suites have the middle of the table, in the base frame, metres."""
+
+
+_STUBBORN = 60
+"""Draws of a start after which what the hand cannot take stays where the goal has it, which is within reach there."""
 
 
 class Rejected(Exception):
@@ -65,6 +70,8 @@ class Drawn(Suite):
         self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
         self._goal: Draft | None = None
         """The newest: what a start must leave room for."""
+        self._drawn = 0
+        """Starts drawn for it."""
         self.choose(np.random.default_rng([seed, 2]))
 
     @abstractmethod
@@ -84,7 +91,16 @@ class Drawn(Suite):
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.devices.suites.reach import stuck
 
-        draft = Draft(self.catalogue, self._shapes, rng, robot=self.robot, table=self.table, hidden=self.hidden[kind])
+        self._drawn = self._drawn + 1 if kind == "start" else 0
+        draft = Draft(
+            self.catalogue,
+            self._shapes,
+            rng,
+            robot=self.robot,
+            table=self.table,
+            hidden=self.hidden[kind],
+            stay=self._fixed() if self._drawn > _STUBBORN else {},
+        )
         self.draw(kind, draft, rng)
         if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
@@ -95,6 +111,11 @@ class Drawn(Suite):
         ):
             raise Rejected("the goal is out of reach around what cannot be moved")
         return draft.layout
+
+    def _fixed(self) -> dict[str, Standing]:
+        """What the hand cannot take, where the goal has it."""
+        placed = self._goal.placed if self._goal is not None else {}
+        return {name: item for name, item in placed.items() if not item.stance.item.grasps}
 
 
 def shift(robot: Robot) -> Floats:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stages.geometry.poses import pose
+from stages.geometry.poses import pose, raised
 from stages.planning.collision import CollisionWorld
 from stages.planning.kinematics import POSITION_TOLERANCE, ROTATION_TOLERANCE
 from stages.planning.motion import (
@@ -18,7 +18,6 @@ from stages.planning.motion import (
     straight_motion,
     time_parameterise,
 )
-from stages.planning.pick_place import raised
 from stages.robots import BUILT_IN, read_robot
 from tests.stages.planning.scenes import ROBOT, catalogue, standing, world
 
