@@ -24,9 +24,9 @@ _OUTLINE = 1.5
 """How clear a silhouette's outline is taken to be: that of an object."""
 _SMALLEST = 60
 """Visible pixels below which nothing can be recognised."""
-_ODDS = 2.3
-_FIRST, _SECOND, _DEPTH, _OUTLINE_FAINT = 0.5, 2.55, 13.4, -8.8
-EXPLAINED, FAINT = 0.8, 0.15
+_ODDS = 2.4
+_FIRST, _SECOND, _DEPTH, _OUTLINE_FAINT = 0.55, 2.7, 12.9, -10.5
+EXPLAINED, FAINT = 0.8, 0.12
 """Log-odds that an object is there with this label: the odds of both judgements, the share of the readings that it
 covers which it explains, from this share on, and the share of its outline that does not show, from that share on.
 `python -m benchmarks.appraisal` fits it."""

@@ -15,9 +15,11 @@ from stages.perception.rendering.rasteriser import Float32s
 
 HIDES = 0.03
 """Metres in front of the surface at which a reading belongs to something that hides it."""
-_BESIDE = 5.0
-"""Pixels from the outline (at 640 pixels across) at which inside and outside are compared: colour may be off depth."""
-_ALIKE = 10.0
+_BESIDE = 3.0
+"""Pixels from the outline (at 640 pixels across) at which inside and outside are compared."""
+_SHIFTS = (-4.0, -2.0, 0.0, 2.0, 4.0)
+"""Pixels (likewise) by which colour may be off depth, in both directions."""
+_ALIKE = 8.0
 """CIELAB units up to which two colours are one: light that falls off along a surface changes it by as much."""
 _LEAST = 20
 """Points of an outline below which it says nothing."""
@@ -28,15 +30,16 @@ def faintness(glimpses: Sequence[Glimpse], rgb: Bytes, depth: Float32s) -> Float
 
     What has an outline of its own differs from what is beside it; what merely fits into a surface has borders where
     none are seen. ``depth`` is H x W metres, 0 where there is no reading. Of the outline those points count that lie in
-    the image with nothing in front beside them.
+    the image with nothing in front beside them; of all small shifts of colour against depth the best counts.
     """
     scale = rgb.shape[1] / 640
     smooth = cv2.GaussianBlur(rgb, (0, 0), scale).astype(np.float32) / 255
     lab = np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.float32)
-    return np.array([_faintness(glimpse, lab, depth, _BESIDE * scale) for glimpse in glimpses])
+    return np.array([_faintness(glimpse, lab, depth, scale) for glimpse in glimpses])
 
 
-def _faintness(glimpse: Glimpse, lab: Float32s, depth: Float32s, beside: float) -> float:
+def _faintness(glimpse: Glimpse, lab: Float32s, depth: Float32s, scale: float) -> float:
+    beside = _BESIDE * scale
     margin = int(2 * beside)
     layer = np.pad(glimpse.inverse.repeat(GLIMPSE_STRIDE, 0).repeat(GLIMPSE_STRIDE, 1), margin)
     corner = GLIMPSE_STRIDE * np.array([glimpse.left, glimpse.top]) - margin
@@ -53,8 +56,15 @@ def _faintness(glimpse: Glimpse, lab: Float32s, depth: Float32s, beside: float) 
     free = ~((read > 0) & (1.0 / surface - read > HIDES))
     if free.sum() < _LEAST:
         return np.nan
-    differs = lab[inside[free, 1], inside[free, 0]] - lab[outside[free, 1], outside[free, 0]]
-    return float(((differs**2).sum(-1) < _ALIKE**2).mean())
+    shifts = [np.rint([dx * scale, dy * scale]).astype(int) for dy in _SHIFTS for dx in _SHIFTS]
+    return min(_alike(lab, inside[free] + shift, outside[free] + shift) for shift in shifts)
+
+
+def _alike(lab: Float32s, one: NDArray[np.int_], other: NDArray[np.int_]) -> float:
+    """Share of pairs of pixels (N x 2 each: x, y; those beyond the image are as its border) that have one colour."""
+    last = np.array(lab.shape[1::-1]) - 1
+    (x, y), (u, v) = np.clip(one, 0, last).T, np.clip(other, 0, last).T
+    return float((((lab[y, x] - lab[v, u]) ** 2).sum(-1) < _ALIKE**2).mean())
 
 
 def _outline(shown: NDArray[np.bool_]) -> NDArray[np.int32]:
