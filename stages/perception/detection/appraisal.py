@@ -25,7 +25,7 @@ _OUTLINE = 1.5
 _SMALLEST = 60
 """Visible pixels below which nothing can be recognised."""
 _ODDS = 2.4
-_FIRST, _SECOND, _DEPTH, _OUTLINE_FAINT = 0.55, 2.7, 12.9, -10.5
+_FIRST, _SECOND, _DEPTH, _BORDER = 0.55, 2.7, 12.9, -10.5
 EXPLAINED, FAINT = 0.8, 0.12
 """Log-odds that an object is there with this label: the odds of both judgements, the share of the readings that it
 covers which it explains, from this share on, and the share of its outline that does not show, from that share on.
@@ -60,7 +60,7 @@ def appraisal(first: Floats, second: Floats, explained: Floats, faint: Floats) -
     """Of confidences before and after the look, the shares of what objects cover that they explain, and those of their
     outlines that do not show (NaN where that cannot be told); N each."""
     outline = np.where(np.isnan(faint), 0.0, faint - FAINT)
-    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second) + _OUTLINE_FAINT * outline
+    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second) + _BORDER * outline
     odds = appearance + _DEPTH * (np.clip(explained, 0, 1) - EXPLAINED)
     return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_SUREST, _SUREST))), EXPLAINED - appearance / _DEPTH)
 
