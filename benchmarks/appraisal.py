@@ -1,14 +1,17 @@
 """How well a look tells right candidates from wrong ones: `python -m benchmarks.appraisal DATASET ... --without LABEL`.
 
 Fits the log-odds of `stages/perception/detection/appraisal.py` to the candidates of all images, and again leaving each
-sensor out. ``--without`` leaves an object out, of which look-alikes stand in the images.
+sensor out. ``--without`` leaves an object out, of which look-alikes stand in the images. Each image is looked at with
+the whole catalogue, with either half of it, to which the objects of the other half are unknown, and as another camera
+would see it.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ import numpy as np
 from benchmarks.candidates import sensor_of
 from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, Truth, detections_file, images
+from benchmarks.common.variations import Objects, by_another_camera, half
 from runner.process.step import step_seed
 from stages.detector import ModelDetector
 from stages.devices.bop import read_dataset
@@ -25,9 +29,10 @@ from stages.hypotheses import Hypotheses
 from stages.messages import Observation
 from stages.messages.digest import Prospect, Sighting
 from stages.particle_filter import ParticleFilter
-from stages.perception.detection.appraisal import EXPLAINED, log_odds, second_confidences, silhouette
+from stages.perception.detection.appraisal import EXPLAINED, FAINT, log_odds, second_confidences, silhouette
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.labels import Judge
+from stages.perception.detection.outline import faintness
 from stages.perception.detection.views import Views
 from stages.perception.rendering.rasteriser import View
 from stages.scene.catalogue import Catalogue
@@ -40,7 +45,7 @@ wrong."""
 _RIDGE = 0.3
 _STEP = 0.2
 """Of the share that is explained: what counts as one unit, so that the ridge weighs on all terms alike."""
-TERMS = ("before the look", "within the silhouette", "explained, a fifth")
+TERMS = ("before the look", "within the silhouette", "explained, a fifth", "faint outline, a fifth")
 
 
 @dataclass(frozen=True)
@@ -53,29 +58,45 @@ class Case:
     right: bool
 
 
-def cases(dataset: Path, without: Sequence[str], learned: Path | None) -> Iterator[Case]:
+def variations(dataset: Path, without: Sequence[str], learned: Path | None, camera: int) -> Iterator[Case]:
+    """The candidates of a data set by the whole catalogue, by either half of it, and by another camera."""
+    whole = Objects(dataset / "models", learned)
+    yield from cases(dataset, without, whole)
+    views = Views.of(whole.catalogue, learned, place="--learned")
+    for odd in (False, True):
+        with tempfile.TemporaryDirectory() as folder:
+            yield from cases(dataset, without, half(whole.catalogue, views, odd, Path(folder)))
+    yield from cases(dataset, without, whole, camera)
+
+
+def cases(dataset: Path, without: Sequence[str], objects: Objects, camera: int | None = None) -> Iterator[Case]:
     """Every candidate of a data set that is right or wrong."""
-    path = dataset / "models"
+    path, learned = objects.catalogue, objects.learned
     catalogue, views = Catalogue.shared(path), Views.of(path, learned, place="--learned")
     detector = ModelDetector(ModelDetector.Config(catalogue=path, learned=learned))
     filters, judge = ParticleFilter(ParticleFilter.Config(catalogue=path)), Judge(views)
     sensors = {(image.scene_id, image.image_id): sensor_of(image) for image in read_dataset(dataset)}
-    for image in images(dataset, detections_file(dataset, "exact")):
+    for taken in images(dataset, detections_file(dataset, "exact")):
+        frame, farther = (taken.frame, 1.0) if camera is None else by_another_camera(taken.frame, camera)
+        image = replace(taken, frame=frame)
         observation, sightings = _looked(image, detector, filters)
         view = View.of(observation.K, *observation.depth.shape[::-1])
         found = [(s.candidate, s.start, s.glimpse) for s in sightings if s.candidate and s.start and s.glimpse]
         regions = [silhouette(each[2], observation.depth, view, observation.T_camera_table) for each in found]
         labels = [views.labels.index(candidate.label) for candidate, _, _ in found]
         second = second_confidences(judge, observation.rgb, regions, labels)
-        for (candidate, start, _), again in zip(found, second.tolist(), strict=True):
+        faint = faintness([glimpse for _, _, glimpse in found], observation.rgb, observation.depth)
+        for (candidate, start, _), again, outline in zip(found, second, np.nan_to_num(faint, nan=FAINT), strict=True):
             item = catalogue[candidate.label]
             truths = [truth for truth in image.truths if truth.label == item.label]
-            right = any(_apart(start.T_camera_object, truth, item.bounds.mean(0)) < _NEAR for truth in truths)
+            middle = item.bounds.mean(0)
+            right = any(_apart(start.T_camera_object, truth, middle, farther) < _NEAR for truth in truths)
             boxes = np.array([truth.box for truth in truths]).reshape(-1, 4)
             touches = intersection_over_union(candidate.box[None], boxes).max(initial=0.0) > _OVERLAP
             if candidate.label not in without and (right or not touches):
                 odds = log_odds(np.array([candidate.confidence, again]))
-                yield Case(sensors[image.id], np.array([1.0, *odds, (start.explained - EXPLAINED) / _STEP]), right)
+                shares = (start.explained - EXPLAINED) / _STEP, (outline - FAINT) / _STEP
+                yield Case(sensors[image.id], np.array([1.0, *odds, *shares]), right)
 
 
 def _looked(
@@ -89,9 +110,9 @@ def _looked(
     return observation, [filters.on_prospect(part, observation, Quiet()) for part in rest if isinstance(part, Prospect)]
 
 
-def _apart(T: Floats, truth: Truth, middle: Floats) -> float:
-    offset = T[:3, :3] @ middle + T[:3, 3] - truth.T_camera_object[:3, :3] @ middle - truth.T_camera_object[:3, 3]
-    return float(np.linalg.norm(offset))
+def _apart(T: Floats, truth: Truth, middle: Floats, farther: float) -> float:
+    there = truth.T_camera_object[:3, :3] @ middle + farther * truth.T_camera_object[:3, 3]
+    return float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - there))
 
 
 def fitted(chosen: Sequence[Case], terms: Sequence[int]) -> Floats:
@@ -122,11 +143,13 @@ def main() -> int:
     parser.add_argument("datasets", type=Path, nargs="+", help="BOP data set folders with boxes of the truth")
     parser.add_argument("--without", action="append", default=[], metavar="LABEL")
     parser.add_argument("--learned", type=Path, help="by default the catalogue is learned now and kept in the cache")
+    parser.add_argument("--camera", type=int, default=1, metavar="SEED", help="the other camera")
     options = parser.parse_args()
-    chosen = [case for dataset in options.datasets for case in cases(dataset, options.without, options.learned)]
+    chosen = [case for dataset in options.datasets
+              for case in variations(dataset, options.without, options.learned, options.camera)]  # fmt: skip
     sensors = sorted({case.sensor for case in chosen})
     print(f"{len(chosen)} candidates, {sum(case.right for case in chosen)} right; sensors: {', '.join(sensors)}")
-    for terms in ((0,), (1,), (0, 1), (0, 1, 2)):
+    for terms in ((0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)):
         weights = fitted(chosen, terms)
         parts = [([c for c in chosen if c.sensor != s], [c for c in chosen if c.sensor == s]) for s in sensors]
         left_out = np.sum([errors(test, fitted(train, terms), terms) for train, test in parts], axis=0)

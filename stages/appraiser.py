@@ -33,12 +33,14 @@ class Appraiser(Stage):
 
         from stages.perception.detection import appraisal
         from stages.perception.detection.labels import Judge
+        from stages.perception.detection.outline import faintness
         from stages.perception.detection.views import Views
 
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("error")
         views = Views.of(config.catalogue, config.learned, place="appraiser.learned")
-        self._judge, self._labels, self._appraisal = Judge(views), views.labels, appraisal
+        self._judge, self._labels = Judge(views), views.labels
+        self._appraisal, self._faintness = appraisal, faintness
 
     def on_sightings(self, sightings: list[Sighting], observation: Observation, ctx: Context) -> Iterator[Sighting]:
         """The same candidates, as sure as what their objects show allows."""
@@ -55,7 +57,8 @@ class Appraiser(Stage):
         second = self._appraisal.second_confidences(self._judge, observation.rgb, regions, columns)
         first = np.array([candidate.confidence for candidate, _, _ in found])
         explained = np.array([start.explained for _, start, _ in found])
-        judged = self._appraisal.appraisal(first, second, explained)
+        faint = self._faintness([glimpse for _, _, glimpse in found], observation.rgb, observation.depth)
+        judged = self._appraisal.appraisal(first, second, explained, faint)
         ctx.log(f"{int((judged.confidences > 0.5).sum())} of {len(found)} candidates are likely once looked at")
         for sighting, (candidate, _, _), region, confidence, share in zip(
             sightings, found, regions, judged.confidences.tolist(), judged.shares.tolist(), strict=True

@@ -15,6 +15,7 @@ from stages.geometry.arrays import Floats
 from stages.messages.digest import GLIMPSE_STRIDE, Glimpse
 from stages.perception.detection.appearance import Bytes
 from stages.perception.detection.labels import Judge
+from stages.perception.detection.outline import HIDES
 from stages.perception.detection.propose import confidences
 from stages.perception.detection.regions import Region, elevation_of
 from stages.perception.rendering.rasteriser import Float32s, View
@@ -23,15 +24,16 @@ _OUTLINE = 1.5
 """How clear a silhouette's outline is taken to be: that of an object."""
 _SMALLEST = 60
 """Visible pixels below which nothing can be recognised."""
-_HIDES = 0.03
-"""Metres in front of the surface at which a reading belongs to something that hides it."""
-_ODDS = 3.7
-_FIRST, _SECOND, _DEPTH = 1.4, 3.1, 12.5
-EXPLAINED = 0.8
-"""Log-odds that an object is there with this label: the odds of both judgements, and the share of the readings that it
-covers which it explains, from this share on. `python -m benchmarks.appraisal` fits it."""
-_CERTAIN = 5.0
-"""Log-odds beyond which a judgement is as good as any."""
+_ODDS = 2.4
+_FIRST, _SECOND, _DEPTH, _BORDER = 0.55, 2.7, 12.9, -10.5
+EXPLAINED, FAINT = 0.8, 0.12
+"""Log-odds that an object is there with this label: the odds of both judgements, the share of the readings that it
+covers which it explains, from this share on, and the share of its outline that does not show, from that share on.
+`python -m benchmarks.appraisal` fits it."""
+_CERTAIN = 3.0
+"""Log-odds beyond which a judgement is as good as any: look-alikes are never out of the question."""
+_SUREST = 5.0
+"""Log-odds that all of it leaves at most."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,13 @@ def second_confidences(judge: Judge, rgb: Bytes, regions: Sequence[Region | None
     return found
 
 
-def appraisal(first: Floats, second: Floats, explained: Floats) -> Appraisal:
-    """Of confidences before and after the look, and the shares of what objects cover that they explain; N each."""
-    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second)
+def appraisal(first: Floats, second: Floats, explained: Floats, faint: Floats) -> Appraisal:
+    """Of confidences before and after the look, the shares of what objects cover that they explain, and those of their
+    outlines that do not show (NaN where that cannot be told); N each."""
+    outline = np.where(np.isnan(faint), 0.0, faint - FAINT)
+    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second) + _BORDER * outline
     odds = appearance + _DEPTH * (np.clip(explained, 0, 1) - EXPLAINED)
-    return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_CERTAIN, _CERTAIN))), EXPLAINED - appearance / _DEPTH)
+    return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_SUREST, _SUREST))), EXPLAINED - appearance / _DEPTH)
 
 
 def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Floats) -> Region | None:
@@ -72,7 +76,7 @@ def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Fl
     bottom, right = top + layer.shape[0], left + layer.shape[1]
     whole, read = layer > 0, depth[top:bottom, left:right]
     z = 1.0 / np.where(whole, layer, 1.0)
-    mask = whole & ~((read > 0) & (z - read > _HIDES))
+    mask = whole & ~((read > 0) & (z - read > HIDES))
     if mask.sum() < _SMALLEST:
         return None
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]

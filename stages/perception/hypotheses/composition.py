@@ -54,12 +54,13 @@ class Composition:
 
     def pixels(self, layers: Sequence[Float32s], reaches: Sequence[NDArray[np.bool_]] | None = None) -> Float32s:
         """Cost of every pixel, H x W metres; ``reaches`` are the masks of the layers where these are not all."""
-        nearest = self.scene.plane_inverse
+        nearest = self.scene.plane_inverse.copy()
         allowed = np.ones_like(self.scene.foreground)
         for layer, reach in zip(layers, self._reaches if reaches is None else reaches, strict=True):
-            nearer = layer > nearest
-            nearest = np.where(nearer, layer, nearest)
-            allowed = np.where(nearer, reach, allowed)
+            part = _part(layer > 0)
+            nearer = layer[part] > nearest[part]
+            np.copyto(nearest[part], layer[part], where=nearer)
+            np.copyto(allowed[part], reach[part], where=nearer)
         return pixel_costs(self.scene, self.credit, nearest, self._form, allowed)
 
 
@@ -83,12 +84,16 @@ def pixel_costs(
     false the object in sight leaves the reading unexplained.
     """
     shown = (nearest > scene.plane_inverse) & (scene.factor > 0)
-    behind = scene.factor * (1.0 / np.where(shown, nearest, 1.0) - scene.depth)
+    part = _part(shown)
+    shown, before = shown[part], credit[part]
+    behind = scene.factor[part] * (1.0 / np.where(shown, nearest[part], 1.0) - scene.depth[part])
     distance = np.minimum(np.abs(behind), form.truncation)
     if not form.plain:
-        distance = np.maximum(distance - scene.leeway, 0.0)
-    explained = distance if allowed is None else np.where(allowed, distance, credit + distance)
-    return np.where(shown, np.where(behind > form.occluder_margin, credit + form.occluder_cost, explained), credit)
+        distance = np.maximum(distance - scene.leeway[part], 0.0)
+    explained = distance if allowed is None else np.where(allowed[part], distance, before + distance)
+    costs = credit.copy()
+    np.copyto(costs[part], np.where(behind > form.occluder_margin, before + form.occluder_cost, explained), where=shown)
+    return costs
 
 
 def charge(box: Floats, start: Start, share: float) -> float:
@@ -135,10 +140,12 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
 
     ``layer`` and ``others`` are H x W inverse depths of the object and of all else.
     """
+    part = _part(layer > 0)
+    layer, factor = layer[part], scene.factor[part]
     silhouette = layer > 0
-    behind = scene.factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth)
-    shown = silhouette & ~((layer < others) | (behind > form.occluder_margin))
-    read = shown & (scene.factor > 0)
+    behind = factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth[part])
+    shown = silhouette & ~((layer < others[part]) | (behind > form.occluder_margin))
+    read = shown & (factor > 0)
     distances = np.minimum(np.abs(behind[read]), form.truncation)
     cost = float(distances.mean(dtype=np.float64)) if read.any() else form.truncation
     return cost, float(shown.sum() / max(1, silhouette.sum()))
@@ -147,11 +154,9 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
 def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse
-    kept = shown[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE]
-    rows, columns = _extent(kept.sum(1) > 0), _extent(kept.sum(0) > 0)
+    rows, columns = part = _part(shown[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE])
     composition = Composition(scene, form, [box])
     change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
-    part = np.s_[rows.start : rows.stop, columns.start : columns.stop]
     inverse, change = (np.where(shown, a, 0.0)[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE][part] for a in (layer, change))
     return Glimpse(
         left=columns.start,
@@ -187,9 +192,10 @@ class FirstLook:
         return _sum(self._change) * GLIMPSE_STRIDE**2 + sum(self._charges[i] for i in chosen)
 
 
-def _extent(kept: NDArray[np.bool_]) -> slice:
-    at = np.flatnonzero(kept)
-    return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 0)
+def _part(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """The smallest part of the image outside of which nothing is shown; most objects are small."""
+    rows, columns = (np.flatnonzero(shown.any(axis)).tolist() for axis in (1, 0))
+    return np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] if rows else np.s_[0:0, 0:0]
 
 
 def _mask(scene: ObservedScene, rectangle: tuple[int, int, int, int]) -> NDArray[np.bool_]:

@@ -252,7 +252,7 @@ class SceneFilter:
         The worst fits come first: an object that alone took another's place must leave before that one is visited.
         """
         keys = self._keys(draft, b"sweep%d" % number)
-        fits = [found.cost for found in self._found(draft.scene, draft.tracks, draft.layers)]
+        fits = {i: fit(draft.scene, draft.layers[i], draft.background(i), self._settings.cost)[0] for i in stale}
         changed: set[int] = set()
         for i in sorted(stale, key=lambda i: (-fits[i], i)):
             self.visits += 1
@@ -377,7 +377,10 @@ def _window(scene: ObservedScene, suspect: Suspect) -> tuple[slice, slice]:
 
 
 def _composite(scene: ObservedScene, layers: Sequence[Float32s]) -> Float32s:
-    return np.maximum.reduce([scene.plane_inverse, *layers])
+    nearest = scene.plane_inverse.copy()
+    for layer in layers:
+        np.maximum(nearest, layer, out=nearest)
+    return nearest
 
 
 def _extended(key: bytes, suspect: Suspect) -> bytes:
