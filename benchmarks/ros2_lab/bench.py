@@ -79,12 +79,12 @@ class Bench:
     def truth(self) -> dict[str, Floats]:
         """T_base_object (4 x 4) by name of what is laid out."""
         with self.lock:
-            return {name: self._pose(name) for name in self._present}
+            return {name: self.pose(name) for name in self._present}
 
     def picture(self) -> tuple[int, int, Floats, dict[str, Floats]]:
         """What the camera sees: version, time in ns, positions of the robot's joints, poses of objects."""
         with self.lock:
-            poses = {name: self._pose(name) for name in self._present}
+            poses = {name: self.pose(name) for name in self._present}
             return self.version, time.time_ns(), self.data.qpos[self.addresses].copy(), poses
 
     def _run(self) -> None:
@@ -127,7 +127,8 @@ class Bench:
         joint.qpos[:] = np.concatenate([T[:3, 3] + [0, 0, _DROP], quaternion])
         joint.qvel[:] = 0
 
-    def _pose(self, name: str) -> Floats:
+    def pose(self, name: str) -> Floats:
+        """T_base_body, 4 x 4; with the lock held."""
         body, T = self.data.body(name), np.eye(4)
         T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
         return T

@@ -11,11 +11,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import cv2
-import mujoco
 import numpy as np
 
 from benchmarks.ros2_lab.bench import ROBOT
-from benchmarks.ros2_lab.wire import Interfaces, Speaker, stamp, transform
+from benchmarks.ros2_lab.wire import Interfaces, Speaker, stamp, transforms
 from stages.devices.simulated_camera import room
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, pose
@@ -26,6 +25,8 @@ from stages.scene.scoring import label_of
 
 FRAME = "camera_color_optical_frame"
 _RATE = 15.0
+_TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""The robot's own base frame in base_link, which the driver of a UR5e has turned by half a turn."""
 _LIGHT = Lighting(
     lights=(Light("directional", (0.3, 0.3, -1.0), 2.0), Light("directional", (0.5, -0.5, -0.6), 1.3)),
     ambient=(0.38, 0.38, 0.38),
@@ -63,10 +64,9 @@ def serve(seed: int, endpoint: str, pipe: Connection) -> None:
     color, depth = (node.publisher(topic, "sensor_msgs/msg/Image", reliable=False) for topic in topics)
     info = node.publisher("/camera/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", reliable=False)
     fixed = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", latched=True)
-    T_said, turn = robot.camera.T_link_camera, np.zeros(4)
+    T_said = robot.camera.T_link_camera
     assert T_said is not None
-    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(T_said[:3, :3]).ravel())
-    fixed(transform(node.new, "base_link", FRAME, T_said[:3, 3], turn))
+    fixed(transforms(node.new, "base_link", {"base": _TURNED, FRAME: _TURNED @ T_said}))
     eye, shown, due = Eye(seed), -1, time.monotonic()
     while True:
         pipe.send("picture")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from benchmarks.ros2_lab.bench import Bench
-from benchmarks.ros2_lab.wire import Server, Speaker, stamp, transform
+from benchmarks.ros2_lab.wire import Server, Speaker, stamp, transforms
 
 FOLLOW, GRIP = "control_msgs/action/FollowJointTrajectory", "control_msgs/action/GripperCommand"
 ARM, GRIPPER = "/scaled_joint_trajectory_controller/follow_joint_trajectory", "/robotiq_gripper_controller/gripper_cmd"
@@ -78,8 +78,7 @@ class Arm:
         if self._steps % _STATES_STEPS == 0:
             self._publish()
         if self._steps % _TOOL_STEPS == 0:
-            body = self._bench.data.body("wrist_3_link")
-            self._tool(transform(self._node.new, "base_link", "wrist_3_link", body.xpos, body.xquat))
+            self._tool(transforms(self._node.new, "base", {"wrist_3_link": self._bench.pose("wrist_3_link")}))
 
     def _guard(self) -> None:
         share = np.abs(self._bench.data.actuator_force[self._motors]) / self._limits

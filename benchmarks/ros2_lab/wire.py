@@ -21,6 +21,7 @@ import yaml
 import zenoh
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 from zenoh import ext
 
 _TEXTS = Path(__file__).parents[2] / "stages" / "devices" / "ros2" / "interfaces.yaml"
@@ -287,13 +288,13 @@ def stamp(time_ns: int) -> dict[str, int]:
     return {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
 
 
-def transform(new: Interfaces, parent: str, child: str, place: Any, quaternion: Any) -> Any:
-    """A tf2_msgs/TFMessage of now; x y z in metres, w x y z."""
-    w, x, y, z = map(float, quaternion)
-    given = {
-        "translation": dict(zip("xyz", map(float, place), strict=True)),
-        "rotation": {"x": x, "y": y, "z": z, "w": w},
-    }
+def transforms(new: Interfaces, parent: str, poses: dict[str, Any]) -> Any:
+    """A tf2_msgs/TFMessage of now; ``poses`` (4 x 4) in the parent, by name."""
     header = {"stamp": stamp(time.time_ns()), "frame_id": parent}
-    one = new("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=given)
-    return new("tf2_msgs/msg/TFMessage", transforms=[one])
+    made: list[Any] = []
+    for child, T in poses.items():
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        translation = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
+        place = {"translation": translation, "rotation": {"x": x, "y": y, "z": z, "w": w}}
+        made.append(new("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=place))
+    return new("tf2_msgs/msg/TFMessage", transforms=made)
