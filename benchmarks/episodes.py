@@ -39,10 +39,11 @@ class Episode:
     verdict: Verdict | None
     judgement: Judgement
     outcomes: tuple[Outcome, ...]
-    corrections: tuple[Correction, ...]
     complete: bool
     reason: str
     recording: Path
+    corrections: tuple[Correction, ...] = ()
+    """What the arm showed of the camera, which takes its time."""
 
     def summary(self) -> dict[str, object]:
         """What ``--json`` writes of it."""
@@ -99,7 +100,7 @@ def judged(path: Path, *, seed: int, code: int, seconds: float, reason: str) -> 
         snapshots = list(_messages(recording, Snapshot))
         judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
     complete = recording.verdict.complete
-    return Episode(seed, code, seconds, verdict, judgement, outcomes, corrections, complete, reason, path)
+    return Episode(seed, code, seconds, verdict, judgement, outcomes, complete, reason, path, corrections)
 
 
 def _messages(recording: Recording, kind: type[M]) -> Iterator[M]:

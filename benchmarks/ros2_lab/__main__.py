@@ -157,7 +157,7 @@ def judged(path: Path, layouts: Layouts, *, seed: int, code: int, seconds: float
         snapshots = [_snapshot(*one) for one in zip(purposes, layouts, strict=True)]
         judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, found["Outcome"])
     outcomes = tuple(found["Outcome"])
-    return Episode(seed, code, seconds, verdict, judgement, outcomes, (), recording.verdict.complete, reason, path)
+    return Episode(seed, code, seconds, verdict, judgement, outcomes, recording.verdict.complete, reason, path)
 
 
 def _snapshot(purpose: str, layout: dict[str, Any]) -> Snapshot:

@@ -259,15 +259,13 @@ def test_domains_namespaces_and_other_names() -> None:
 
 
 def test_others_see_the_node_in_the_graph() -> None:
-    tokens: list[str] = []
     with router() as endpoint, node(endpoint, "talker", namespace="lab") as talker:
-        publisher = talker.publisher("words", STRING)
+        publisher, zid = talker.publisher("words", STRING), str(talker.session.info.zid())
+        tokens = {f"@ros2_lv/0/{zid}/0/0/NN/%/%lab/talker", publisher.endpoint.token}
         config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}}}')
         with zenoh.open(config) as session:
-            wait_until(lambda: tokens.extend(_tokens(session)) or tokens)
-        zid = str(talker.session.info.zid())
-    assert set(tokens) == {f"@ros2_lv/0/{zid}/0/0/NN/%/%lab/talker", publisher.endpoint.token}
+            wait_until(lambda: _tokens(session) == tokens)
 
 
-def _tokens(session: zenoh.Session) -> list[str]:
-    return [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**") if reply.ok is not None]
+def _tokens(session: zenoh.Session) -> set[str]:
+    return {str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**") if reply.ok is not None}
