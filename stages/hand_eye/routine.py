@@ -16,7 +16,7 @@ from stages.hand_eye.solving import Fit, Sight, left_out, solve, turns
 from stages.messages import CameraCalibration, Frame, LookRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.planning.collision import CollisionWorld
-from stages.planning.motion import free_motion, time_parameterise
+from stages.planning.motion import arm, free_motion, robot_command
 
 Steps = Generator[RobotCommand | LookRequest, Any, CameraCalibration]
 """Yields what is asked and is sent the answer: a robot state, or a frame."""
@@ -44,8 +44,8 @@ class CalibrationRoutine:
     def run(self, rng: np.random.Generator) -> Steps:
         """From wherever the arm stands."""
         self._sights = []
-        state: RobotState = yield _command()
-        at = self._arm(state)
+        state: RobotState = yield self._read()
+        at = arm(self._rig.robot, state)
         if touching := self._world.contacts(at):
             return self.failure(f"where the arm stands, {_pairs(touching)} would touch: move it, or the board")
         postures = proposed(self._rig, self._world, Sightlines(self._robot), self._poses, rng)
@@ -57,12 +57,12 @@ class CalibrationRoutine:
                 self._log(f"pose {number} of {len(postures)}: no free way there")
                 continue
             state = yield self._move(path, f"calibration pose {number} of {len(postures)}")
-            at = self._arm(state)
+            at = arm(self._rig.robot, state)
             if state.stopped:
                 return self.failure(f"{state.stopped}: {state.reason}; the arm stands where it is")
             frame: Frame = yield LookRequest(purpose=f"calibration pose {number}")
-            state = yield _command()
-            self._see(frame, self._arm(state), at, f"pose {number} of {len(postures)}")
+            state = yield self._read()
+            self._see(frame, arm(self._rig.robot, state), at, f"pose {number} of {len(postures)}")
         back = free_motion(self._world, at, self._rig.robot.home, rng)
         if back is not None:
             yield self._move(back, "go home")
@@ -91,20 +91,11 @@ class CalibrationRoutine:
         """Nothing was found, and why."""
         return _calibration(self._rig, success=False, reason=reason)
 
-    def _arm(self, state: RobotState) -> Floats:
-        joints = dict(zip(state.joint_names, state.positions.tolist(), strict=True))
-        return np.array([joints[name] for name in self._rig.robot.joints])
+    def _read(self) -> RobotCommand:
+        return robot_command(self._rig.robot, "read the encoders")
 
     def _move(self, path: Floats, label: str) -> RobotCommand:
-        motion = time_parameterise(self._rig.robot, path, speed=_SPEED)
-        return RobotCommand(
-            joint_names=self._rig.robot.joints,
-            times=motion.times,
-            positions=motion.positions,
-            velocities=motion.velocities,
-            label=label,
-            guard=_GUARD,
-        )
+        return robot_command(self._rig.robot, label, path, speed=_SPEED, guard=_GUARD)
 
 
 def too_alike(sights: Sequence[Sight], limits: Limits, carrier: str) -> str:
@@ -177,11 +168,6 @@ def _error(metres: Any, radians: Any) -> str:
 def _calibration(rig: Rig, **fields: Any) -> CameraCalibration:
     nothing: dict[str, Any] = dict.fromkeys(("residuals", "left_out_metres", "left_out_radians"), np.zeros(0))
     return CameraCalibration(camera_link=rig.robot.camera.link, board_link=rig.link, **(nothing | fields))
-
-
-def _command() -> RobotCommand:
-    """Reads the encoders."""
-    return RobotCommand(times=np.zeros(0), positions=np.zeros((0, 0)), velocities=np.zeros((0, 0)))
 
 
 def _pairs(touching: set[tuple[str, str]]) -> str:
