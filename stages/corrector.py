@@ -30,6 +30,8 @@ _CANDIDATES = 20
 """Postures among which the most telling ones are chosen."""
 _FEWEST = 2
 """Postures without which nothing is said of the camera."""
+_MORE_WAYS = 2
+"""Ways home that are tried where none was found or one was barred: an arm in view hides what is to be seen."""
 _HAND_CAMERA = (
     "the camera is in the hand and does not see how it is held: its pose in the hand has to be measured with a board"
 )
@@ -156,8 +158,11 @@ class Corrector(Stage):
         if arrived.stopped == STOPPED:
             # What was asked for falls away; the next look has the arm show itself again.
             self._state = State()
-        elif state.phase is Phase.HOMING:
+        elif state.phase is Phase.HOMING and (arrived.success or not state.ahead):
             yield from self._concluded(ctx)
+        elif state.phase is Phase.HOMING:
+            self._state = replace(state, ahead=state.ahead[1:])
+            yield state.ahead[0]
         elif arrived.success:
             self._state = replace(state, phase=Phase.LOOKING, at=arrived)
             number = len(state.sights) + 1
@@ -207,7 +212,7 @@ class Corrector(Stage):
         state = self._state
         *ahead, home = state.ahead
         if len(state.sights) == self._config.postures or not ahead:
-            self._state = replace(state, phase=Phase.HOMING, ahead=())
+            self._state = replace(state, phase=Phase.HOMING, ahead=(home,) * _MORE_WAYS)
             return home
         self._state = replace(state, phase=Phase.MOVING, ahead=(*ahead[1:], home))
         return ahead[0]

@@ -217,10 +217,10 @@ def _simple_setup(world: CollisionWorld, start: Floats, goal: Floats) -> Any:
     joints = len(start)
     space = ob.RealVectorStateSpace(joints)
     bounds = ob.RealVectorBounds(joints)
-    for i in range(joints):
-        # Room for rounding: a start on a joint limit is valid.
-        bounds.setLow(i, float(world.lower[i]) - 1e-6)
-        bounds.setHigh(i, float(world.upper[i]) + 1e-6)
+    # Encoders may read a little beyond a joint's limit: from there, too, there is a way.
+    for i, (low, high) in enumerate(zip(np.minimum(world.lower, start), np.maximum(world.upper, start), strict=True)):
+        bounds.setLow(i, float(low) - 1e-6)
+        bounds.setHigh(i, float(high) + 1e-6)
     space.setBounds(bounds)
     setup = og.SimpleSetup(space)
     information = setup.getSpaceInformation()

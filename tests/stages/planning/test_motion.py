@@ -103,6 +103,12 @@ def test_free_motion_is_collision_free_and_repeatable(scene: CollisionWorld) -> 
     assert all(scene.is_free(q) for q in timed.positions)
 
 
+def test_an_arm_whose_encoders_read_beyond_a_limit_finds_a_way(scene: CollisionWorld) -> None:
+    beyond = HOME.copy()
+    beyond[0] = scene.lower[0] - 0.005
+    assert free_motion(scene, beyond, HOME, np.random.default_rng(5)) is not None
+
+
 def test_trajectories_respect_the_limits() -> None:
     waypoints = HOME + np.array([[0.0], [0.3], [-0.2], [0.4]]) * np.array([0.1, 1, 1, 1, 1, 1, 1, 1])
     waypoints[:, 0] = HOME[0] - np.abs(waypoints[:, 0] - HOME[0])
