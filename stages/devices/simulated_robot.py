@@ -14,7 +14,7 @@ from stages.devices.simulation import Simulation
 from stages.devices.suites.suite import Suite
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.messages import Brake, LookRequest, RobotCommand, RobotState, Snapshot
+from stages.messages import Brake, LookRequest, RobotCommand, RobotState, SensorErrors, Snapshot
 from stages.robots import Robot
 from stages.scene.catalogue import Catalogue
 
@@ -39,19 +39,23 @@ class SimulatedRobot(Stage):
     def on_look_request(self, look_request: LookRequest, ctx: Context) -> Snapshot:
         """The world as it is now, for the simulated camera."""
         self._meddle(_LOOK, ctx)
-        table = self._suite.table
         rng = np.random.default_rng([self._seed, 3, self._looks])
         self._looks += 1
+        return self.snapshot(look_request.purpose, self._wrong.at_a_look(rng))
+
+    def snapshot(self, purpose: str, errors: SensorErrors | None = None) -> Snapshot:
+        """The world as it is, with what is wrong with the sensors that look at it."""
+        table = self._suite.table
         return Snapshot(
             names=self._simulation.present,
             T_base_objects=self._simulation.object_poses(),
             joint_names=self._robot.joint_names,
             joint_positions=self._encoders(),
             time=self._simulation.time,
-            purpose=look_request.purpose,
+            purpose=purpose,
             T_base_table=pose(np.eye(3), np.array([*table.center, table.height])),
             table_size=np.array(table.size),
-            errors=self._wrong.at_a_look(rng),
+            errors=errors,
         )
 
     def on_robot_command(self, robot_command: RobotCommand, ctx: Context) -> Iterator[RobotState | None]:
