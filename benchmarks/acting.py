@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from runner import contract
 from runner.contract import Level, Message
 from stages.demonstrator import Demonstrator
 from stages.devices.suites import kinds
@@ -174,13 +175,20 @@ class Robot:
         return pose(turn @ T[:3, :3], T[:3, 3] + rng.normal(0, self._metres, 3))
 
     def _carry_out(self, answer: RobotCommand | Outcome | Arrived | None) -> Outcome:
-        while isinstance(answer, RobotCommand):
-            states = self._world.on_robot_command(answer, self._ctx)
-            state = next(each for each in states if each is not None)
-            answer = self._executor.on_robot_state(state, self._ctx)
-        assert isinstance(answer, Outcome)
-        self.episode.outcomes.append(answer)
-        return answer
+        outcome = carried_out(answer, self._executor, self._world, self._ctx)
+        assert isinstance(outcome, Outcome)
+        self.episode.outcomes.append(outcome)
+        return outcome
+
+
+def carried_out(
+    answer: RobotCommand | Outcome | Arrived | None, executor: Executor, world: World, ctx: contract.Context
+) -> Outcome | Arrived | None:
+    """What comes of an executor's motion when the world moves as it says."""
+    while isinstance(answer, RobotCommand):
+        state = next(each for each in world.on_robot_command(answer, ctx) if each is not None)
+        answer = executor.on_robot_state(state, ctx)
+    return answer
 
 
 _NO_OBSERVATION = Observation(

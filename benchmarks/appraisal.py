@@ -21,6 +21,7 @@ from benchmarks.common.command import command
 from benchmarks.common.datasets import Image, Truth, detections_file, images
 from benchmarks.common.variations import Objects, by_another_camera, half
 from runner.process.step import step_seed
+from stages.appraiser import Likenesses
 from stages.detector import ModelDetector
 from stages.devices.bop import read_dataset
 from stages.estimate import Quiet
@@ -29,7 +30,17 @@ from stages.hypotheses import Hypotheses
 from stages.messages import Observation
 from stages.messages.digest import Prospect, Sighting
 from stages.particle_filter import ParticleFilter
-from stages.perception.detection.appraisal import EXPLAINED, FAINT, log_odds, second_confidences, silhouette
+from stages.perception.detection.alignment import aligned
+from stages.perception.detection.appraisal import (
+    ALIKE,
+    EXPLAINED,
+    FAINT,
+    bounded_likeness,
+    log_odds,
+    second_confidences,
+    silhouette,
+    visible_mask,
+)
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.labels import Judge
 from stages.perception.detection.outline import faintness
@@ -45,7 +56,13 @@ wrong."""
 _RIDGE = 0.3
 _STEP = 0.2
 """Of the share that is explained: what counts as one unit, so that the ridge weighs on all terms alike."""
-TERMS = ("before the look", "within the silhouette", "explained, a fifth", "faint outline, a fifth")
+TERMS = (
+    "before the look",
+    "within the silhouette",
+    "explained, a fifth",
+    "faint outline, a fifth",
+    "as if it were there",
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +92,7 @@ def cases(dataset: Path, without: Sequence[str], objects: Objects, camera: int |
     catalogue, views = Catalogue.shared(path), Views.of(path, learned, place="--learned")
     detector = ModelDetector(ModelDetector.Config(catalogue=path, learned=learned))
     filters, judge = ParticleFilter(ParticleFilter.Config(catalogue=path)), Judge(views)
+    likenesses = Likenesses(catalogue)
     sensors = {(image.scene_id, image.image_id): sensor_of(image) for image in read_dataset(dataset)}
     for taken in images(dataset, detections_file(dataset, "exact")):
         frame, farther = (taken.frame, 1.0) if camera is None else by_another_camera(taken.frame, camera)
@@ -84,9 +102,14 @@ def cases(dataset: Path, without: Sequence[str], objects: Objects, camera: int |
         found = [(s.candidate, s.start, s.glimpse) for s in sightings if s.candidate and s.start and s.glimpse]
         regions = [silhouette(each[2], observation.depth, view, observation.T_camera_table) for each in found]
         labels = [views.labels.index(candidate.label) for candidate, _, _ in found]
-        second = second_confidences(judge, observation.rgb, regions, labels)
-        faint = faintness([glimpse for _, _, glimpse in found], observation.rgb, observation.depth)
-        for (candidate, start, _), again, outline in zip(found, second, np.nan_to_num(faint, nan=FAINT), strict=True):
+        rgb = aligned(observation.rgb, observation.depth)
+        second = second_confidences(judge, rgb, regions, labels)
+        faint = np.nan_to_num(faintness([glimpse for _, _, glimpse in found], rgb, observation.depth), nan=FAINT)
+        for (candidate, start, _), region, again, outline in zip(found, regions, second, faint, strict=True):
+            alike = np.nan
+            if region is not None:
+                shown = visible_mask(region, view)
+                alike = likenesses(rgb, view, shown, candidate.label, start.T_camera_object)
             item = catalogue[candidate.label]
             truths = [truth for truth in image.truths if truth.label == item.label]
             middle = item.bounds.mean(0)
@@ -96,7 +119,8 @@ def cases(dataset: Path, without: Sequence[str], objects: Objects, camera: int |
             if candidate.label not in without and (right or not touches):
                 odds = log_odds(np.array([candidate.confidence, again]))
                 shares = (start.explained - EXPLAINED) / _STEP, (outline - FAINT) / _STEP
-                yield Case(sensors[image.id], np.array([1.0, *odds, *shares]), right)
+                paint = np.nan_to_num(bounded_likeness(np.array(alike)) - ALIKE)
+                yield Case(sensors[image.id], np.array([1.0, *odds, *shares, paint]), right)
 
 
 def _looked(
@@ -149,7 +173,7 @@ def main() -> int:
               for case in variations(dataset, options.without, options.learned, options.camera)]  # fmt: skip
     sensors = sorted({case.sensor for case in chosen})
     print(f"{len(chosen)} candidates, {sum(case.right for case in chosen)} right; sensors: {', '.join(sensors)}")
-    for terms in ((0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)):
+    for terms in (range(count) for count in range(1, len(TERMS) + 1)):
         weights = fitted(chosen, terms)
         parts = [([c for c in chosen if c.sensor != s], [c for c in chosen if c.sensor == s]) for s in sensors]
         left_out = np.sum([errors(test, fitted(train, terms), terms) for train, test in parts], axis=0)

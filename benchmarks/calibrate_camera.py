@@ -19,7 +19,7 @@ import numpy as np
 
 from runner.testing import Run, finish, runner
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3, inverse, pose, rotation_angle
+from stages.geometry.poses import exp_so3, inverse, pose, random_direction, rotation_angle
 from stages.hand_eye.board import Board
 from stages.hand_eye.rig import Rig
 from stages.messages import CameraCalibration, Snapshot
@@ -57,7 +57,7 @@ def calibrate(case: str, seed: int, settings: Sequence[str] = ()) -> Result:
     model = ROBOTS / f"{CASES[case]}.yaml"
     rng = np.random.default_rng([seed, 6])
     X = Rig(read_robot(model), Board()).X
-    wrong = X @ pose(exp_so3(TURN * _direction(rng)), SHIFT * _direction(rng))
+    wrong = X @ pose(exp_so3(TURN * random_direction(rng)), SHIFT * random_direction(rng))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         own = folder / "own.yaml"
@@ -82,11 +82,6 @@ def _run(folder: Path, *settings: str) -> Run:
 def _apart(one: Floats, other: Floats) -> tuple[float, float]:
     T = inverse(one) @ other
     return float(np.linalg.norm(T[:3, 3])), float(rotation_angle(T[:3, :3], np.eye(3)))
-
-
-def _direction(rng: np.random.Generator) -> Floats:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)
 
 
 HEADER = (

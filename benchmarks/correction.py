@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.acting import carried_out
 from benchmarks.looks import ROOT, Perception
 from runner.contract import Message
 from runner.graph.graph import load_graph
@@ -30,7 +31,6 @@ from stages.messages import (
     Frame,
     LookRequest,
     PostureRequest,
-    RobotCommand,
     SceneGraph,
     Snapshot,
 )
@@ -92,14 +92,10 @@ class Lab:
         self._camera.close()
 
     def _moved(self, request: PostureRequest) -> Arrived:
-        answer = self._executor.on_posture_request(request, self._ctx)
-        while isinstance(answer, RobotCommand):
-            (state,) = (one for one in self._world.on_robot_command(answer, self._ctx) if one is not None)
-            following = self._executor.on_robot_state(state, self._ctx)
-            assert following is not None
-            answer = following
-        assert isinstance(answer, Arrived)
-        return answer
+        asked = self._executor.on_posture_request(request, self._ctx)
+        arrived = carried_out(asked, self._executor, self._world, self._ctx)
+        assert isinstance(arrived, Arrived)
+        return arrived
 
 
 class Hand:

@@ -59,6 +59,7 @@ class Episode:
             "robot_seconds": round(sum(one.robot_seconds for one in (*self.outcomes, *self.corrections)), 2),
             "wall_seconds": round(self.seconds, 2),
             "failing_stage": self.failing_stage,
+            "refused": self.refused,
             "reason": "" if self.code == 0 else self.reason,
             "differences": list(judgement.differences),
             "losses": list(map(str, losses)),
@@ -73,6 +74,11 @@ class Episode:
         if self.verdict is None:
             return "runner"
         return "perception" if self.judgement.false_success else self.verdict.failed_stage
+
+    @property
+    def refused(self) -> bool:
+        """Whether the planner found no way and said so before anything moved."""
+        return self.failing_stage == "planner" and not self.outcomes
 
 
 def run(seed: int, graph: Path, settings: Sequence[str]) -> Episode:
@@ -92,18 +98,19 @@ def run(seed: int, graph: Path, settings: Sequence[str]) -> Episode:
 def judged(path: Path, *, seed: int, code: int, seconds: float, reason: str) -> Episode:
     """An episode as its recording tells it."""
     recording = Recording(path)
-    verdict = next(iter(_messages(recording, Verdict)), None)
-    outcomes, corrections = tuple(_messages(recording, Outcome)), tuple(_messages(recording, Correction))
+    verdict = next(iter(messages(recording, Verdict)), None)
+    outcomes, corrections = tuple(messages(recording, Outcome)), tuple(messages(recording, Correction))
     judgement = Judgement(claimed=False)
     if verdict is not None:
-        goal = next((goal for goal in _messages(recording, Goal) if goal.name == verdict.goal_name), None)
-        snapshots = list(_messages(recording, Snapshot))
+        goal = next((goal for goal in messages(recording, Goal) if goal.name == verdict.goal_name), None)
+        snapshots = list(messages(recording, Snapshot))
         judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
     complete = recording.verdict.complete
     return Episode(seed, code, seconds, verdict, judgement, outcomes, complete, reason, path, corrections)
 
 
-def _messages(recording: Recording, kind: type[M]) -> Iterator[M]:
+def messages(recording: Recording, kind: type[M]) -> Iterator[M]:
+    """Every recorded message of a type, in order."""
     for envelope in recording.envelopes():
         if envelope.type == kind.__name__:
             yield open_envelope(kind, envelope)
@@ -138,7 +145,8 @@ def totals(episodes: Sequence[Episode]) -> str:
     judgements = [episode.judgement for episode in episodes]
     losses = [loss for judgement in judgements for loss in judgement.losses]
     return (
-        f"{sum(episode.code == 0 for episode in episodes)} of {len(episodes)} restored; in truth "
+        f"{sum(episode.code == 0 for episode in episodes)} of {len(episodes)} restored, "
+        f"{sum(episode.refused for episode in episodes)} refused before anything moved; in truth "
         f"{sum(one.restored for one in judgements)}, false successes {sum(one.false_success for one in judgements)}, "
         f"objects lost {len(losses)}, {sum(not loss.said for loss in losses)} of them unsaid"
     )

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.acting import Context
 from runner.contract import Message
 from runner.graph.graph import graph_from_json
 from runner.recording.recording import Recording, opened
 from stages.devices.simulated_camera import SimulatedCamera
+from stages.estimate import Quiet
 from stages.messages import Rgb, RobotState
 from stages.perception.rendering.contact_sheet import looking_at
 from stages.robots import read_robot
@@ -52,7 +52,7 @@ def film(path: Path) -> Iterator[Rgb]:
     graph = graph_from_json(recording.run["graph"], str(path))
     config = graph.nodes["world"].config
     world, robot = World(config), read_robot(config.robot)
-    camera, ctx = SimulatedCamera(Catalogue.shared(config.catalogue), robot), Context(np.random.default_rng(0), False)
+    camera, ctx = SimulatedCamera(Catalogue.shared(config.catalogue), robot), Quiet()
     drawn = -np.inf
     for step in recording.steps:
         if step.stage != "world" or not step.consumed:

@@ -4,9 +4,11 @@ Runs a graph with a camera of five pictures a second and one stage a core that c
 
 * the time from opening the page's address to its first paint, in a browser without a cache: median and slowest;
 * how far the picture on the page is behind the camera: from when it was taken to when the browser has painted it;
-* what the graph computes a second, and what the page's server takes of a core, without a page process, with one that
-  nobody has open, with one open page and with ten. Open pages are connections that take everything and every picture:
-  what browsers draw would be drawn on other machines. Every round measures each once, in turns.
+* what the graph computes a second and the processor time that it has for it, and what the page's server and the open
+  pages take of a core: without a page process, with one that nobody has open, with one open page and with ten. Open
+  pages are connections that take everything and every picture: what browsers draw would be drawn on other machines, as
+  would what these take. Every round measures each once, in turns; shares are medians of what each round has beside its
+  own measurement without a page.
 
 Needs chromium.
 """
@@ -18,23 +20,25 @@ import asyncio
 import contextlib
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import AsyncGenerator, Generator
+from http.client import HTTPConnection, HTTPException
 from pathlib import Path
+from queue import Queue
 from statistics import median
 from typing import Any
-from urllib.error import HTTPError
-from urllib.request import urlopen
+from urllib.parse import urlsplit
 
+import numpy as np
 import psutil
 from playwright.sync_api import sync_playwright
 from websockets.asyncio.client import connect
 
 from benchmarks.live import process, running
 from runner.live.live import Live
+from runner.page.start import page_beside
+from stages.geometry.arrays import Floats
 
 SECONDS = 10.0
 """Of each measurement."""
@@ -57,13 +61,9 @@ DELAYS = """
 @contextlib.contextmanager
 def served(live: Live) -> Generator[tuple[psutil.Process, str]]:
     """A page process on a run, and its address."""
-    command = [sys.executable, "-m", "runner.cli", "page", "--run", live.entry.run]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as page:
-        try:
-            assert page.stdout is not None
-            yield psutil.Process(page.pid), page.stdout.readline().split()[1]
-        finally:
-            page.terminate()
+    said = Queue[str]()
+    with page_beside(live.entry.run, said.put) as page:
+        yield psutil.Process(page.pid), said.get(timeout=60).split()[1]
 
 
 def shown(url: str, rounds: int) -> tuple[list[float], list[float]]:
@@ -98,7 +98,9 @@ async def visitors(url: str, count: int) -> AsyncGenerator[None]:
 
 
 async def _visit(url: str, caught_up: asyncio.Event) -> None:
-    seen = ""
+    """One page: as in a browser, all its pictures come over one connection."""
+    place, seen = urlsplit(url), ""
+    pictures = HTTPConnection(place.netloc)
     async with connect(url.replace("http", "ws") + "live", max_size=None) as socket:
         await socket.send(json.dumps({"view": "scene", "language": "en"}))
         async for text in socket:
@@ -106,35 +108,40 @@ async def _visit(url: str, caught_up: asyncio.Event) -> None:
             view = told["value"].get("view") if told["name"] == "told en" else None
             if view and view["photo"]["key"] != seen:
                 seen = view["photo"]["key"]
-                await asyncio.to_thread(_fetch, f"{url}photo/{seen}.jpg")
+                await asyncio.to_thread(_fetch, pictures, f"{place.path}photo/{seen}.jpg")
                 if time.time() - int(seen) * 1e-9 < 1.0:
                     caught_up.set()
 
 
-def _fetch(url: str) -> None:
-    with contextlib.suppress(HTTPError), urlopen(url) as answer:
-        answer.read()
+def _fetch(connection: HTTPConnection, path: str) -> None:
+    try:
+        connection.request("GET", path)
+        connection.getresponse().read()
+    except (HTTPException, ConnectionError):  # the server has closed what was idle; the next picture opens it again
+        connection.close()
 
 
-async def cost(live: Live, page: psutil.Process | None, url: str, count: int) -> tuple[float, float]:
-    """Words that the graph says a second, and the share of a core that the page's server takes."""
+async def cost(live: Live, page: psutil.Process | None, url: str, count: int) -> Floats:
+    """Words that the graph says a second, and the shares of a core that what says them, the page's server and the open
+    pages have."""
     async with visitors(url, count):
         await asyncio.sleep(SETTLE_SECONDS)
-        before, began, used = _words(live), time.monotonic(), _cpu(page)
+        before, began = _used(live, page), time.monotonic()
         await asyncio.sleep(SECONDS)
-        seconds = time.monotonic() - began
-        return (_words(live) - before) / seconds, (_cpu(page) - used) / seconds
+        return (_used(live, page) - before) / (time.monotonic() - began)
 
 
-def _words(live: Live) -> int:
+def _used(live: Live, page: psutil.Process | None) -> Floats:
+    """Words, and seconds of a core, so far."""
     status = live.status()
-    return sum(process(status, f"grinder{k}").sent["word"].messages for k in range(os.cpu_count() or 1))
+    grinders = [process(status, f"grinder{k}") for k in range(os.cpu_count() or 1)]
+    words = sum(grinder.sent["word"].messages for grinder in grinders)
+    computing = sum(_seconds(psutil.Process(grinder.pid)) for grinder in grinders)
+    return np.array([words, computing, _seconds(page) if page else 0.0, _seconds(psutil.Process())])
 
 
-def _cpu(page: psutil.Process | None) -> float:
-    if page is None:
-        return 0.0
-    times = page.cpu_times()
+def _seconds(process: psutil.Process) -> float:
+    times = process.cpu_times()
     return times.user + times.system
 
 
@@ -143,7 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
-    stages = {"camera": {"stage": "benchmarks.recording_stages:Camera", "config": {"hertz": 5, "seconds": 3600}}}
+    stages = {"camera": {"stage": "benchmarks.page_stages:Photographer", "config": {"hertz": 5, "seconds": 3600}}}
     stages |= {f"grinder{k}": {"stage": "benchmarks.page_stages:Grinder"} for k in range(os.cpu_count() or 1)}
     story = "benchmarks.page_stages:PictureStory"
     with tempfile.TemporaryDirectory() as folder, running(Path(folder), "page", stages, story=story) as live:
@@ -151,17 +158,21 @@ def main() -> None:
             paints, delays = shown(url, options.rounds)
         print(f"first paint     {median(paints):6.0f} ms, slowest of {len(paints)} {max(paints):.0f} ms")
         print(f"picture behind  {median(delays):6.0f} ms, slowest of {len(delays)} {max(delays):.0f} ms", flush=True)
-        found: dict[int | None, list[tuple[float, float]]] = {count: [] for count in COUNTS}
+        found: dict[int | None, list[Floats]] = {count: [] for count in COUNTS}
         for _ in range(options.rounds):
             found[None].append(asyncio.run(cost(live, None, "", 0)))
             with served(live) as (page, url):
                 for count in (0, 1, 10):
                     found[count].append(asyncio.run(cost(live, page, url, count)))
-    alone = median(words for words, _ in found[None])
+    alone = np.array(found[None])[:, :2]
     for count, measured in found.items():
-        words, cpu = (median(column) for column in zip(*measured, strict=True))
+        said, computing, cpu, own = np.median(measured, 0)
+        words, cores = np.median(np.array(measured)[:, :2] / alone, 0)
         name = "no page process" if count is None else f"{count} open pages"
-        print(f"{name:<16}{words:8.1f} words/s ({words / alone:6.1%}), page's server {cpu:6.2%} of a core")
+        print(
+            f"{name:<16}{said:8.1f} words/s ({words:6.1%}), of a core: what says them {computing:7.2%} ({cores:6.1%}), "
+            f"server {cpu:6.2%}, pages {own:6.2%}"
+        )
 
 
 if __name__ == "__main__":

@@ -6,14 +6,25 @@ import os
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 
-from benchmarks.recording_stages import Picture, Word
+from benchmarks.recording_stages import Camera, Pace, Picture, Word
 from runner.contract import Context, Message, Stage
 from runner.page.story import Doing, Heard, Language, Outline, Photo, Told, View
 
 SIZE = 160
 """Of the matrices that are multiplied: some milliseconds a time."""
+
+
+class Photographer(Camera):
+    """A camera whose pictures are as smooth as photographs: noise would be five times as large as a JPEG."""
+
+    def __init__(self, config: Pace) -> None:
+        super().__init__(config)
+        rng = np.random.default_rng(0)
+        shades = cv2.resize(rng.uniform(40, 215, (24, 32, 3)), (640, 480), interpolation=cv2.INTER_CUBIC)
+        self._rgb = np.clip(shades + rng.normal(0, 4, shades.shape), 0, 255).astype(np.uint8)
 
 
 class Grinder(Stage):
@@ -47,6 +58,10 @@ class PictureStory:
 
     def recall(self) -> None:
         """Nothing is kept."""
+
+    def say(self, refusal: str, language: Language) -> str:
+        """As it is."""
+        return refusal
 
     def tell(self, language: Language) -> Told:
         """The picture."""

@@ -143,6 +143,10 @@ Migrations = Mapping[tuple[str, int], Migration]
 ``migrations:``."""
 
 
+EXIT_REFUSED = 2
+"""Exit status of commands and processes that end with :class:`Refused`."""
+
+
 class Refused(Exception):
     """Bad input or configuration from outside: one line that names value, place and valid choices.
 

@@ -8,11 +8,40 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from runner.contract import Context, Stage
+from stages.geometry.arrays import Floats
+from stages.geometry.poses import compose
 from stages.messages import Observation
 from stages.messages.digest import Candidate, Sighting
+from stages.perception.refinement.colour import ColourSettings, likeness, load
+from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import View
+from stages.scene.catalogue import Catalogue
+
+_HOPELESS = 0.01
+"""Confidence below which, whatever the photograph shows, an object is not there: it is not drawn."""
+_YAW_STEP = np.deg2rad(30.0)
+"""Between the turns about a continuous axis at which an object is compared with the photograph."""
+
+
+class Likenesses:
+    """How much photographs look as if objects of a catalogue were there."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._paints = {name: Paint.of(item.mesh) for name, item in catalogue.objects.items()}
+        self._turns = {name: item.symmetries.transforms(_YAW_STEP) for name, item in catalogue.objects.items()}
+        self._settings = ColourSettings()
+        load()
+
+    def __call__(
+        self, rgb: NDArray[np.uint8], view: View, shown: NDArray[np.bool_], label: str, T_camera_object: Floats
+    ) -> float:
+        """Of an H x W x 3 image, in which the object is seen within ``shown`` (H x W) if it is there; as
+        :func:`likeness`."""
+        poses = compose(T_camera_object[None], self._turns[label])[:, :3]
+        return likeness(rgb, view, shown, poses, paint=self._paints[label], settings=self._settings)
 
 
 class Appraiser(Stage):
@@ -32,6 +61,7 @@ class Appraiser(Stage):
         import torch
 
         from stages.perception.detection import appraisal
+        from stages.perception.detection.alignment import aligned
         from stages.perception.detection.labels import Judge
         from stages.perception.detection.outline import faintness
         from stages.perception.detection.views import Views
@@ -40,7 +70,8 @@ class Appraiser(Stage):
         torch.set_deterministic_debug_mode("error")
         views = Views.of(config.catalogue, config.learned, place="appraiser.learned")
         self._judge, self._labels = Judge(views), views.labels
-        self._appraisal, self._faintness = appraisal, faintness
+        self._appraisal, self._aligned, self._faintness = appraisal, aligned, faintness
+        self._likenesses = Likenesses(Catalogue.shared(config.catalogue))
 
     def on_sightings(self, sightings: list[Sighting], observation: Observation, ctx: Context) -> Iterator[Sighting]:
         """The same candidates, as sure as what their objects show allows."""
@@ -54,11 +85,20 @@ class Appraiser(Stage):
             for _, _, glimpse in found
         ]
         columns = [self._labels.index(candidate.label) for candidate, _, _ in found]
-        second = self._appraisal.second_confidences(self._judge, observation.rgb, regions, columns)
+        rgb = self._aligned(observation.rgb, observation.depth)
+        second = self._appraisal.second_confidences(self._judge, rgb, regions, columns)
         first = np.array([candidate.confidence for candidate, _, _ in found])
         explained = np.array([start.explained for _, start, _ in found])
-        faint = self._faintness([glimpse for _, _, glimpse in found], observation.rgb, observation.depth)
-        judged = self._appraisal.appraisal(first, second, explained, faint)
+        faint = self._faintness([glimpse for _, _, glimpse in found], rgb, observation.depth)
+        rest = first, second, explained, faint
+        hopes = self._appraisal.appraisal(*rest, np.full(len(found), np.nan)).confidences > _HOPELESS
+        alike = np.full(len(found), np.nan)
+        for i in np.flatnonzero(hopes).tolist():
+            candidate, start, _ = found[i]
+            if (region := regions[i]) is not None:
+                shown = self._appraisal.visible_mask(region, view)
+                alike[i] = self._likenesses(rgb, view, shown, candidate.label, start.T_camera_object)
+        judged = self._appraisal.appraisal(*rest, alike)
         ctx.log(f"{int((judged.confidences > 0.5).sum())} of {len(found)} candidates are likely once looked at")
         for sighting, (candidate, _, _), region, confidence, share in zip(
             sightings, found, regions, judged.confidences.tolist(), judged.shares.tolist(), strict=True

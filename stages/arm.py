@@ -24,7 +24,7 @@ class Ros2Arm(Stage):
     """Has commands carried out by controllers that ROS 2 nodes offer, and breaks them off where a guard does not hold.
 
     Nothing moves but with the operator's word: the arm is armed, and the camera is calibrated to it. Without it
-    motions are only shown, as ghosts.
+    motions are only shown, as ghosts: all of them since somebody last read the encoders.
     """
 
     device: ClassVar[bool] = True
@@ -49,18 +49,19 @@ class Ros2Arm(Stage):
         self._config = config
         self._robot = read_robot(config.robot)
         self._arm = RemoteArm(config.link, self._robot, config.controllers, config.care)
+        self._why = self._withheld()
 
     def on_robot_command(self, robot_command: RobotCommand, ctx: Context) -> Iterator[Said | None]:
         """Carries a command out; what else arrives is heard in between, so that somebody may stop the arm."""
         arm, moves = self._arm, len(robot_command.times) or robot_command.gripper_width is not None
-        if moves and (why := self._withheld()):
-            yield from self._show(robot_command, why)
+        if moves and self._why:
+            yield from self._show(robot_command)
             return
         for _ in arm.carry_out(robot_command, lambda: ctx.rng.bytes(16)):
             yield from self._told(ctx, at_least=_BATCH)
             yield None
         yield from self._told(ctx, at_least=1)
-        yield self._state(arm.stopped, arm.reason)
+        yield self._state(arm.stopped, arm.reason or self._why)
 
     def on_brake(self, brake: Brake) -> None:
         """Stops the arm where it is."""
@@ -76,13 +77,13 @@ class Ros2Arm(Stage):
         lacking = [name for name in ("armed", "calibrated") if getattr(config, name) is False]
         return f"nothing moves, only shown: set arm.{'=true and arm.'.join(lacking)}=true" if lacking else ""
 
-    def _show(self, command: RobotCommand, why: str) -> Iterator[Said]:
+    def _show(self, command: RobotCommand) -> Iterator[Said]:
         """The motion as a ghost. The encoders stay as they are; once the hand would close, there is no more to show."""
         if len(command.times) and self._arm.known():
             self._arm.show(command)
             yield Ros2Sent(messages=self._take(self._arm.sent))
         closes = command.gripper_width is not None and command.gripper_width < self._robot.gripper.open_width / 2
-        yield self._state("fault" if closes else "", why)
+        yield self._state("fault" if closes else "", self._why)
 
     def _told(self, ctx: Context, *, at_least: int) -> Iterator[Said]:
         """What was sent since the last time, and what was heard, where it is so many messages."""
@@ -117,4 +118,5 @@ class Ros2Arm(Stage):
             stopped=stopped,
             reason=reason,
             force=arm.force,
+            shown=bool(self._why),
         )

@@ -1,4 +1,4 @@
-"""Looks through and corrected: before the first one, the arm shows itself to a camera that nobody calibrated."""
+"""Looks through, taken from where they are wanted, and corrected by what the arm showed of its camera."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
 from stages.messages import Arrived, Calibrate, Correction, Frame, LookRequest, PostureRequest
-from stages.messages.correction import OWN_ARM
+from stages.messages.correction import CAMERAS_WAY, OWN_ARM
 from stages.messages.task import STOPPED
 from stages.perception.correction.body import RobotSurface
 from stages.perception.correction.occupied import occupied
 from stages.perception.correction.registration import Posture, Registration, Sight
 from stages.perception.rendering.rasteriser import View
-from stages.robots import BUILT_IN, Robot, read_robot
+from stages.robots import BUILT_IN, read_robot
 
 if TYPE_CHECKING:
     from stages.perception.correction.registration import Fit
@@ -35,6 +34,8 @@ _MORE_WAYS = 2
 _HAND_CAMERA = (
     "the camera is in the hand and does not see how it is held: its pose in the hand has to be measured with a board"
 )
+_NOWHERE = "nobody knows where the camera stands to the robot"
+_NO_TABLE = "no table is seen where the robot works"
 
 
 class Phase(Enum):
@@ -45,6 +46,8 @@ class Phase(Enum):
     MOVING = "the arm"
     LOOKING = "a look at the arm"
     HOMING = "the arm to come home"
+    SCOUTING = "a look at what is in the way of the camera"
+    TURNING = "the camera to get where it looks from"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +58,14 @@ class State:
     due: bool = True
     """The arm shows itself before the next look."""
     asked: LookRequest | None = None
-    """The look that waits for it."""
+    """The look that waits for the arm."""
+    view: int | None = 0
+    """From where the camera looks, as in :attr:`LookRequest.view`; None where it did not get there."""
     ahead: tuple[PostureRequest, ...] = ()
     """Postures that are left to try, the most telling first."""
     at: Arrived | None = None
-    view: View | None = None
+    pixels: View | None = None
+    """Those of the depth camera."""
     sights: tuple[Sight, ...] = ()
     robot_seconds: float = 0.0
     correction: Correction | None = None
@@ -72,6 +78,9 @@ class Corrector(Stage):
     Before the first look, and when somebody asks for it, the arm goes to a few postures over the table; its surface,
     which description and encoders give, is registered to what the depth camera reads of it. What is found holds until
     it is asked for again.
+
+    A look from another of the robot's views waits until the arm has brought the camera there, around what is seen from
+    where it is now. Where the arm does not get there, the look is from where it stands.
     """
 
     stateful = True
@@ -121,7 +130,7 @@ class Corrector(Stage):
         """Has the arm show itself before the next look."""
         if not self._config.calibrate:
             raise Refused("corrector.calibrate is false")
-        if _in_hand(self._robot):
+        if self._robot.camera_in_hand:
             raise Refused(_HAND_CAMERA)
         if self._state.phase is not Phase.IDLE:
             raise Refused(f"under way: waits for {self._state.phase.value}")
@@ -129,12 +138,12 @@ class Corrector(Stage):
         ctx.log("the arm shows itself before the next look")
 
     def on_look_request(self, look_request: LookRequest, ctx: Context) -> Iterator[LookRequest | Correction]:
-        """Passes the request on, once the arm has shown itself."""
+        """Passes the request on, once the arm has shown itself and the camera is where it is wanted."""
         if not self._state.due:
-            yield look_request
+            yield self._from_its_view(look_request)
             return
-        self._state = State(phase=Phase.SURVEYING, asked=look_request)
-        if _in_hand(self._robot):
+        self._state = State(phase=Phase.SURVEYING, asked=look_request, view=self._state.view)
+        if self._robot.camera_in_hand:
             yield from self._given_up(_HAND_CAMERA, ctx)
         else:
             yield LookRequest(purpose=f"{OWN_ARM}: what is in the way")
@@ -149,6 +158,8 @@ class Corrector(Stage):
             posture = Posture(state.at.joint_names, state.at.positions, frame.T_base_camera)
             self._state = replace(state, sights=(*state.sights, Sight(posture, frame.depth)))
             yield self._next()
+        elif state.phase is Phase.SCOUTING:
+            yield self._turned(frame, ctx)
         else:
             yield _corrected(frame, state.correction)
 
@@ -156,9 +167,13 @@ class Corrector(Stage):
         """Looks at the arm, or goes on where it did not get there; after a touch it goes home."""
         state = self._state = replace(self._state, robot_seconds=self._state.robot_seconds + arrived.robot_seconds)
         if arrived.stopped == STOPPED:
-            # What was asked for falls away; the next look has the arm show itself again.
-            self._state = State()
+            # What was asked for falls away; an arm that was showing itself does so again before the next look.
+            turning = state.phase is Phase.TURNING
+            self._state = replace(state, phase=Phase.IDLE, asked=None, view=None) if turning else State()
+        elif state.phase is Phase.TURNING:
+            yield self._looked(arrived.success)
         elif state.phase is Phase.HOMING and (arrived.success or not state.ahead):
+            self._state = replace(state, view=0 if arrived.success else None)
             yield from self._concluded(ctx)
         elif state.phase is Phase.HOMING:
             self._state = replace(state, ahead=state.ahead[1:])
@@ -174,16 +189,62 @@ class Corrector(Stage):
     def _survey(self, frame: Frame, ctx: Context) -> Iterator[PostureRequest | LookRequest | Correction]:
         """Chooses postures around what is in the way."""
         if frame.T_base_camera is None:
-            yield from self._given_up("nobody knows where the camera stands to the robot", ctx)
+            yield from self._given_up(_NOWHERE, ctx)
             return
-        view = View.of(frame.K, frame.depth.shape[1], frame.depth.shape[0])
-        readings = frame.depth if frame.robot_mask is None else np.where(frame.robot_mask, 0, frame.depth)
-        seen = occupied(readings.astype(np.float32), view, frame.T_base_camera, self._robot, ctx.rng)
+        seen = self._in_the_way(frame, ctx)
         if seen is None:
-            yield from self._given_up("no table is seen where the robot works", ctx)
+            yield from self._given_up(_NO_TABLE, ctx)
             return
-        self._state = replace(self._state, view=view, ahead=tuple(self._proposed(*seen, view, ctx)))
+        view = _view_of(frame)
+        self._state = replace(self._state, pixels=view, ahead=tuple(self._proposed(*seen, view, ctx)))
         yield self._next()
+
+    def _in_the_way(self, frame: Frame, ctx: Context) -> tuple[float, Floats] | None:
+        """The table's height and boxes around what stands on it; None where no table is seen."""
+        assert frame.T_base_camera is not None  # Who asks has seen to that.
+        readings = frame.depth if frame.robot_mask is None else np.where(frame.robot_mask, 0, frame.depth)
+        return occupied(readings.astype(np.float32), _view_of(frame), frame.T_base_camera, self._robot, ctx.rng)
+
+    def _from_its_view(self, asked: LookRequest) -> LookRequest:
+        """The look; where the camera has to go elsewhere for it, first one at what is in the way."""
+        if asked.view == self._state.view:
+            return asked
+        if asked.view > len(self._robot.views):
+            there_are = f"{self._config.robot} has {len(self._robot.views)}"
+            raise Refused(f"view {asked.view}: {there_are}; demonstrator.robot must be the same")
+        self._state = replace(self._state, phase=Phase.SCOUTING, asked=asked)
+        return LookRequest(purpose=CAMERAS_WAY)
+
+    def _turned(self, frame: Frame, ctx: Context) -> PostureRequest | LookRequest:
+        """Has the camera brought to where it is wanted."""
+        asked = self._state.asked
+        assert asked is not None
+        if frame.T_base_camera is None:
+            return self._stays(_NOWHERE, ctx)
+        seen = self._in_the_way(_corrected(frame, self._state.correction), ctx)
+        if seen is None:
+            return self._stays(_NO_TABLE, ctx)
+        self._state = replace(self._state, phase=Phase.TURNING)
+        height, boxes = seen
+        return PostureRequest(
+            joint_names=self._robot.joints,
+            positions=(self._robot.home, *self._robot.views)[asked.view],
+            table_height=height,
+            occupied=boxes,
+            label=f"look from view {asked.view}" if asked.view else "look from home",
+        )
+
+    def _stays(self, why: str, ctx: Context) -> LookRequest:
+        """The look that was asked for, from where the camera is."""
+        ctx.log(f"{why}; the camera stays where it is", level="warning")
+        return self._looked(False)
+
+    def _looked(self, there: bool) -> LookRequest:
+        """The look that was asked for, from where the camera is now."""
+        asked = self._state.asked
+        assert asked is not None
+        self._state = replace(self._state, phase=Phase.IDLE, asked=None, view=asked.view if there else None)
+        return asked
 
     def _proposed(self, height: float, boxes: Floats, view: View, ctx: Context) -> Iterator[PostureRequest]:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
@@ -222,8 +283,8 @@ class Corrector(Stage):
         if len(state.sights) < _FEWEST:
             yield from self._given_up(f"the arm could show itself in {len(state.sights)} postures only", ctx)
             return
-        assert state.view is not None
-        fit = Registration(self._surface, state.view, self._config.prior).fit(state.sights)
+        assert state.pixels is not None
+        fit = Registration(self._surface, state.pixels, self._config.prior).fit(state.sights)
         yield from self._settled(self._correction(fit), ctx)
 
     def _correction(self, fit: Fit) -> Correction:
@@ -250,10 +311,10 @@ class Corrector(Stage):
         """Keeps the correction, says it, and takes the look that was asked for."""
         asked = self._state.asked
         assert asked is not None
-        self._state = State(due=False, correction=correction)
+        self._state = State(due=False, correction=correction, view=self._state.view)
         ctx.log(told(correction), level="info" if correction.found else "warning")
         yield correction
-        yield asked
+        yield self._from_its_view(asked)
 
 
 def told(correction: Correction) -> str:
@@ -269,6 +330,10 @@ def told(correction: Correction) -> str:
     )
 
 
+def _view_of(frame: Frame) -> View:
+    return View.of(frame.K, frame.depth.shape[1], frame.depth.shape[0])
+
+
 def _corrected(frame: Frame, correction: Correction | None) -> Frame:
     if correction is None or not correction.found or frame.T_base_camera is None:
         return frame
@@ -277,13 +342,3 @@ def _corrected(frame: Frame, correction: Correction | None) -> Frame:
         depth=frame.depth * np.float32(correction.depth),
         T_base_camera=frame.T_base_camera @ correction.T_believed_true,
     )
-
-
-def _in_hand(robot: Robot) -> bool:
-    """Whether the camera moves with the hand."""
-
-    def held(q: Floats) -> Floats:
-        T_base_links = robot.body.link_poses(robot.joints, q)
-        return inverse(robot.camera_pose(robot.joints, q)) @ T_base_links[robot.gripper.link]
-
-    return bool(np.allclose(held(robot.home), held(robot.home + 0.1)))

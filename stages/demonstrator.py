@@ -45,6 +45,8 @@ from stages.perception.confidence.memory import Memory
 from stages.planning.hiding import hiders
 from stages.planning.pddl import goal_pddl
 from stages.planning.placements import Scene
+from stages.robots import BUILT_IN as ROBOT
+from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import corrected, open_doubt
 from stages.scene.goals import check_name
@@ -79,7 +81,11 @@ class State:
     purpose: str = "goal"
     """What the current scene is looked at for."""
     repeats: int = 0
-    """Looks at the current scene beyond the first."""
+    """Times that the current scene was looked at again."""
+    views: tuple[int, ...] = (0,)
+    """From where it is being looked at, and will be: numbers of :attr:`LookRequest.view`."""
+    seen: frozenset[str] = frozenset()
+    """Names of what it showed from the views before."""
     looks: int = 0
     plans: int = 0
     replans: int = 0
@@ -133,9 +139,10 @@ class Demonstrator(Stage):
     """Remembers a demonstrated scene as the goal and drives the robot until it holds again.
 
     One :class:`State` and no clock. What a look does not show counts as being where it was last seen or placed, unless
-    that place is seen empty. After each transfer the scene is perceived again and planned from again,
-    since targets depend on poses; comparing the new plan with what the old one still had to do says whether
-    the plan was kept, repaired or replaced. Every way through ends in exactly one verdict; without the script
+    that place is seen empty. A scene that is new, or lacks something, is looked at from all of the robot's views, from
+    home last; what only an earlier look shows is remembered. After each transfer the scene is perceived again and
+    planned from again, since targets depend on poses; comparing the new plan with what the old one still had to do says
+    whether the plan was kept, repaired or replaced. Every way through ends in exactly one verdict; without the script
     the next command may follow.
     """
 
@@ -143,9 +150,11 @@ class Demonstrator(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """How long to persist."""
+        """From where to look, and how long to persist."""
 
         catalogue: Path
+        robot: Path = ROBOT
+        """Whose views a scene is looked at from."""
         scripted: bool = True
         """Shows a goal, disturbs it and restores it; else only what is called happens."""
         goal_name: str = "breakfast"
@@ -177,6 +186,7 @@ class Demonstrator(Stage):
     def __init__(self, config: Config) -> None:
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
+        self._views = len(read_robot(config.robot).views)
         self._memory = Memory(self._catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
         self._state = State(goal_name=config.goal_name) if config.scripted else State(phase=Phase.IDLE)
@@ -290,13 +300,22 @@ class Demonstrator(Stage):
             yield question
             return
         scene = self._memory.complete(scene_graph, self._state.known, observation)
+        seen, ahead = self._state.seen | _names(scene_graph), self._state.views[1:]
+        self._state = replace(
+            self._state,
+            known={item.name: item for item in scene.objects},
+            looks=self._state.looks + 1,
+            seen=seen,
+        )
+        if ahead:
+            self._state = replace(self._state, views=ahead)
+            yield self._look_request()
+            return
         self._state = replace(
             self._state,
             scene=scene,
             first=self._state.first or (scene if self._state.goal is not None else None),
-            known={item.name: item for item in scene.objects},
-            remembered=tuple(sorted(_names(scene) - _names(scene_graph))),
-            looks=self._state.looks + 1,
+            remembered=tuple(sorted(_names(scene) - seen)),
         )
         whole = self._state.whole
         if whole is not None and _names(whole) <= _names(scene):
@@ -327,7 +346,7 @@ class Demonstrator(Stage):
             return self._look_for(self._state.missing, self._state.scene, ctx)
         if plan.status == "satisfied":
             return self._look_again("planner", "the planner finds nothing to do, yet relations are violated", ctx)
-        if self._state.failures:
+        if self._state.complaint:
             return self._look_again("executor", f"{self._state.complaint}; no other way: {plan.reason}", ctx)
         return self._look_again("planner", plan.reason, ctx)
 
@@ -416,9 +435,17 @@ class Demonstrator(Stage):
         return hiders(missing, Scene.of(scene, self._stances), movable, heights)
 
     def _look(self, purpose: str) -> LookRequest:
-        self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose)
-        suffix = f", look {self._state.repeats + 1}" if self._state.repeats else ""
-        return LookRequest(purpose=purpose + suffix)
+        """From home; for a goal first from elsewhere, where nothing is known of the scene or it is looked at again."""
+        around = self._state.goal_name and (self._state.repeats or not self._state.known)
+        views = (*range(1, self._views + 1), 0) if around else (0,)
+        self._state = replace(self._state, phase=Phase.LOOKING, purpose=purpose, views=views, seen=frozenset())
+        return self._look_request()
+
+    def _look_request(self) -> LookRequest:
+        state = self._state
+        again = f", look {state.repeats + 1}" if state.repeats else ""
+        where = f", from view {state.views[0]}" if state.views[0] else ""
+        return LookRequest(purpose=state.purpose + again + where, view=state.views[0])
 
     def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Task | Verdict:
         """One more look at the same scene (its noise is new), or the verdict once these are used up."""
@@ -534,7 +561,7 @@ class Demonstrator(Stage):
         self._state = replace(
             state, phase=Phase.TRANSFERRING, transfer=first, remainder=tuple(rest), replans=replans, transfers=number
         )
-        return TransferRequest(transfer=first, scene=state.scene, number=number)
+        return TransferRequest(transfer=first, scene=state.scene, number=number, then=tuple(rest))
 
     def _fail(self, stage: str, reason: str, ctx: Context) -> Verdict:
         ctx.log(f"giving up: {reason}", level="error")
@@ -551,6 +578,8 @@ class Demonstrator(Stage):
         goal = state.whole or state.goal
         if goal is not None and state.scene is not None:
             held, violated = satisfied(goal, state.scene, self._catalogue)
+        if state.lacking and state.lacking not in reason:
+            reason = f"{reason}; {state.lacking}"
         if fallen := self._fallen():
             reason = f"{reason}; knocked over: {', '.join(fallen)}"
         phase = Phase.DONE if self._config.scripted else Phase.IDLE

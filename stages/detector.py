@@ -18,6 +18,10 @@ from stages.scene.catalogue import Catalogue
 
 _FAR = np.float32(100.0)
 """Metres: the robot's own body is put where no object is looked for."""
+_SURE = 0.9
+"""Confidence from which on the network knows a label. Little of an object, it takes for another one at less."""
+_OTHERS = 7
+"""Labels by which a candidate is known beside its own, where that is in doubt: as many as were tried."""
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
 
 
@@ -77,7 +81,7 @@ class Detector(Stage):
         # A second box of one object, or one of its part, is no other object.
         objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
         kept = slice(sure if config.expected != "auto" and objects >= config.expected else None)
-        message = _candidates(found.boxes[kept], found.confidences[kept], labels)
+        message = _candidates(found.boxes[kept], found.confidences[kept], labels, others=_OTHERS)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))
         return message
 
@@ -168,11 +172,17 @@ class RecordedDetections(Stage):
         return _candidates(boxes, confidences, self._labels)
 
 
-def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...]) -> Candidates:
-    """Equation 1: each box with its most confident label."""
+def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int = 0) -> Candidates:
+    """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt."""
+    orders = np.argsort(-confidences, 1, kind="stable")
     candidates = tuple(
-        Candidate(box=box, label=labels[int(row.argmax())], confidence=float(row.max()))
-        for box, row in zip(boxes, confidences, strict=True)
+        Candidate(
+            box=box,
+            label=labels[order[0]],
+            confidence=float(row[order[0]]),
+            others=() if row[order[0]] >= _SURE else tuple(labels[k] for k in order[1 : 1 + others]),
+        )
+        for box, row, order in zip(boxes, confidences, orders, strict=True)
     )
     return Candidates(candidates=candidates, labels=labels, confidences=confidences)
 

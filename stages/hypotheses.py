@@ -22,7 +22,7 @@ from stages.perception.hypotheses.combinations import (
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
-from stages.perception.hypotheses.revisions import Revision, is_better, revisions
+from stages.perception.hypotheses.revisions import Revision, is_better, relabelled, revisions
 from stages.perception.observation.preprocessing import preprocess
 
 
@@ -60,7 +60,7 @@ class Hypotheses(Stage):
         max_hypotheses: int = 32
         """Cap on h without first looks, highest joint confidence first."""
         finalists: int = 8
-        """Cap on h with first looks, least cost first."""
+        """Cap on h with first looks, and on the revisions and on the other labels of a round, least cost first."""
         revisions: int = 4
         """Rounds in which the best scene is revised at most, where N_c is not known."""
         max_height: float = 0.6
@@ -111,6 +111,7 @@ class Hypotheses(Stage):
             several = sum(is_better(each.log_weight, known) for each in posteriors) > 1
             before = () if several else search.unexplained
             revised = revisions(best, search.offers, before)[: self.config.finalists]
+            revised += relabelled(best, search.offers, before)[: self.config.finalists]
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained")
             following = msgspec.structs.replace(
@@ -148,7 +149,10 @@ class Hypotheses(Stage):
             Placed(candidate=found[i].candidate, T_camera_object=found[i].start.T_camera_object)
             for i in combinations[0]
         )
-        offers = tuple(Offer(candidate=each.candidate, share=each.share) for each in found)
+        offers = (
+            *(Offer(candidate=each.candidate, share=each.share) for each in found),
+            *(offer for each in found for offer in _instead(each)),
+        )
         search = None if number is not None else Search(offers=offers)
         for index, chosen in enumerate(combinations):
             yield Hypothesis(
@@ -207,6 +211,13 @@ def _revised(best: Posterior, revised: Sequence[Revision], search: Search) -> It
             shares=tuple(offers[k].share for k in each.new),
             search=search if index == 0 else msgspec.structs.replace(search, earlier=()),
         )
+
+
+def _instead(found: _Found) -> Iterator[Offer]:
+    """The candidate by the labels that it may have instead."""
+    for label in found.candidate.others:
+        other = msgspec.structs.replace(found.candidate, label=label, others=())
+        yield Offer(candidate=other, share=found.share, instead=True)
 
 
 def _candidate(item: ObjectPose) -> Candidate:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from msgspec.structs import replace as replace_fields
 
 from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
@@ -24,7 +25,7 @@ from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighb
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.stance import Stances, Standing
-from stages.scene.virtual import satisfied
+from stages.scene.virtual import rerooted, satisfied
 
 SEARCHES = 16
 """Times that a plan is searched for, each knowing more of what is in the way."""
@@ -34,6 +35,11 @@ _ASIDE = 100
 
 class Impossible(Exception):
     """No plan reaches the goal; the text says why and names the objects."""
+
+    def __init__(self, why: str, blocked: Blocked | None = None) -> None:
+        super().__init__(why)
+        self.blocked = blocked
+        """The last step that had no place; None where none was tried."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +55,21 @@ class Attempt:
         """The attempt that makes room for a step, or None where nothing is left to try.
 
         What stands in the way is moved first, or placed later if the plan itself put it there. A region without
-        room may have it elsewhere: then the object that has the region is moved first.
+        room may have it elsewhere, and what carries the object may stand where the hand does not get above it: then
+        what the object goes beside is moved first, or what that is beside, and so on; or else what carries it.
         """
         step, problem = blocked.step, self.problem
         earlier = {before.item for before in steps[: steps.index(step)]}
-        parent = (step.parent,) if step.region else ()
-        for names in (problem.graspable & set(blocked.obstacles), parent):
-            placed = set(names) & earlier
+        obstacles = problem.graspable & set(blocked.obstacles)
+        beside = [*problem.beside(step.item)] if step.region else []
+        below = [step.destination, *problem.beside(step.destination)] if step.destination != TABLE else []
+        for names in (obstacles, *({name} for name in (*beside, *below))):
+            placed = names & earlier
             if placed - self.reluctant:
                 return replace(self, reluctant=self.reluctant | placed)
-            added = {(name, step.item, step.destination) for name in set(names) & problem.graspable - earlier}
-            added |= {(step.item, name, problem.finally_at(name)) for name in placed - {step.destination, step.parent}}
+            added = {(name, step.item, step.destination) for name in names & problem.graspable - earlier}
+            meanwhile = placed & obstacles - {step.destination, step.parent}
+            added |= {(step.item, name, problem.finally_at(name)) for name in meanwhile}
             if added - problem.obstructions:
                 return replace(self, problem=replace(problem, obstructions=problem.obstructions | added))
         return None
@@ -107,6 +117,13 @@ class Planner(Stage):
         missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
         if missing:
             return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
+        return self._plan(task, task.goal, ctx)
+
+    def _plan(self, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
+        """A plan for the task's goal, which may tell the regions that were ``taught`` the other way round.
+
+        Where an object is in the way of the hand that puts another one beside it, the other one comes first.
+        """
         held, violated = satisfied(task.goal, task.current, self._catalogue)
         problem = self._problem(task, held)
         text = problem_pddl(task.goal_name, problem, task.current, task.goal)
@@ -114,9 +131,16 @@ class Planner(Stage):
             return _answer("satisfied", text)
         try:
             self._check(problem, task)
-            return self._solve_with_room(problem, task, ctx)
+            return self._solve_with_room(problem, task, taught, ctx)
         except Impossible as reason:
-            return _answer("refused", text, reason=str(reason))
+            refused, blocked = _answer("refused", text, reason=str(reason)), reason.blocked
+        if task.goal is not taught or blocked is None or blocked.step.parent not in blocked.obstacles:
+            return refused
+        if not problem.graspable.issuperset(problem.beside(blocked.step.item)):
+            return refused
+        ctx.log(f"{refused.reason}; places {blocked.step.item} first")
+        plan = self._plan(replace_fields(task, goal=rerooted(taught, blocked.step.item)), taught, ctx)
+        return plan if plan.status == "solved" else refused
 
     def _put_aside(self, task: Task, ctx: Context) -> Plan:
         """One transfer, to a place on the table where the object hides nothing of what it hides now."""
@@ -124,7 +148,7 @@ class Planner(Stage):
         step = Step(task.aside, scene.supports[task.aside], TABLE)
         workspace = replace(self._config.workspace, targets=_ASIDE)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
-        poses = Targets(Placements(task.current, self._stances), workspace, self._robot, handling, {}).of(
+        poses = Targets(Placements(task.current, self._stances, task.current), workspace, self._robot, handling, {}).of(
             (step,), scene
         )
         if isinstance(poses, Blocked | Crowded):
@@ -165,6 +189,8 @@ class Planner(Stage):
             raise Impossible("no transfer changes what is violated: every object is where the goal has it")
         if circle := cycle(problem.goal):
             raise Impossible(f"in the goal {_listed(circle, sort=False)} rest on each other in a circle")
+        if circle := cycle({item: region.parent for item, region in problem.regions.items()}):
+            raise Impossible(f"in the goal {_listed(circle, sort=False)} are beside each other in a circle")
         labels = {item.name: item.label for item in task.current.objects}
         fixed = [item for item in problem.items if item not in problem.graspable]
         for item in fixed:
@@ -177,7 +203,7 @@ class Planner(Stage):
             if support in problem.clear or problem.goal.get(support, TABLE) != problem.supports.get(support, TABLE):
                 raise Impossible(f"{item} on {support} would have to move, but it {why}")
 
-    def _solve_with_room(self, problem: Problem, task: Task, ctx: Context) -> Plan:
+    def _solve_with_room(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
         scene = Scene.of(task.current, self._stances)
         beside = {
@@ -188,23 +214,23 @@ class Planner(Stage):
         }
         if beside:
             with suppress(Impossible):
-                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task, ctx)
-        return self._solve(problem, task, ctx)
+                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task, taught, ctx)
+        return self._solve(problem, task, taught, ctx)
 
-    def _solve(self, problem: Problem, task: Task, ctx: Context) -> Plan:
+    def _solve(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
         current = Scene.of(task.current, self._stances)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
-        placements = Placements(task.goal, self._stances)
+        placements = Placements(task.goal, self._stances, taught)
         targets = Targets(placements, self._config.workspace, self._robot, handling, wanted(task.goal))
         avoided = frozenset(task.avoid)
-        because = ""
+        blocked: Blocked | None = None
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
         for _ in range(SEARCHES):
             text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
             solution = self._search(attempt, text)
             if solution.steps is None:
-                raise Impossible(because or _dead_end(attempt.problem, problem))
+                raise Impossible(_no_room(blocked) if blocked else _dead_end(attempt.problem, problem), blocked)
             again = [step for step in solution.steps if _key(step) in avoided]
             poses = targets.of(solution.steps, current, again=again, late=attempt.reluctant)
             if isinstance(poses, Crowded):
@@ -213,13 +239,12 @@ class Planner(Stage):
             if not isinstance(poses, Blocked):
                 transfers = [_transfer(*pair, attempt.problem) for pair in zip(solution.steps, poses, strict=True)]
                 return _answer("solved", text, transfers=transfers, expanded=solution.expanded)
-            because = _no_room(poses)
-            following = attempt.after(poses, solution.steps)
+            blocked, following = poses, attempt.after(poses, solution.steps)
             if following is None:
-                raise Impossible(because)
-            ctx.log(f"{because}; looks for another way")
+                break
+            ctx.log(f"{_no_room(blocked)}; looks for another way")
             attempt = following
-        raise Impossible(because)
+        raise Impossible(_no_room(blocked) if blocked else "no order of transfers leaves room for the hand", blocked)
 
     def _search(self, attempt: Attempt, text: str) -> Solution:
         if self._config.engine == search.BFS:

@@ -208,10 +208,22 @@ class Views:
             yield scene_nodes("graph/goal", message.scene, self._catalogue)
         if isinstance(message, Plan):
             yield Text("text/plan", plan_text(message))
+            yield from self._planned(message)
+        if isinstance(message, Outcome) and message.success:
+            yield Clear(f"world/plan/{message.object}")
         line = progress_line(message)
         if line:
             self._progress.append(line)
             yield Text("text/progress", "\n".join(f"- {item}" for item in self._progress))
+
+    def _planned(self, plan: Plan) -> Iterator[Drawing]:
+        """Ghosts of objects where the plan puts them."""
+        yield Clear("world/plan")
+        for transfer in plan.transfers:
+            if label := self._shown.get(transfer.object):
+                ghost = _swollen(self._catalogue[label].simplified(GHOST_TRIANGLES))
+                strips = _edges(ghost, transfer.T_base_targets[0])
+                yield Lines3D(f"world/plan/{transfer.object}", strips, _GHOST, radius=0.0006)
 
     def _frame(self, frame: Frame) -> Iterator[Drawing]:
         self._frames[frame.scene_id, frame.image_id, frame.name] = frame

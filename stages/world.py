@@ -42,6 +42,8 @@ class World(SimulatedRobot):
         seed: int = 0
         goal: str = "auto"
         """Of the suite ``tray``: a goal template by name, or ``auto`` (chosen by the seed)."""
+        calibrated: bool = False
+        """Somebody has measured where the camera is, with a board."""
 
         def __post_init__(self) -> None:
             if self.seed < 0:
@@ -52,7 +54,7 @@ class World(SimulatedRobot):
         self._config, self._catalogue = config, Catalogue.shared(config.catalogue)
         robot = read_robot(config.robot)
         suite = kinds.suite(config.suite, self._catalogue, robot, config.seed, goal=config.goal)
-        super().__init__(robot, suite, self._catalogue, config.seed)
+        super().__init__(robot, suite, self._catalogue, config.seed, calibrated=config.calibrated)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:
         """Lays out the goal or a start scene, lets it settle and draws again where something fell."""

@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from runner.testing import finish, read_until, runner, start_graph
+from stages.messages import Answer, Question
 from tests.runner.page.browser import browser, faults, opened
 
 ROOT = Path(__file__).parents[1]
@@ -41,6 +42,60 @@ def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: py
         process.terminate()
     run = finish(process, tmp_path, before=printed)
     assert "COMPLETE" in run.output
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_person_is_asked_what_a_look_leaves_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The detector does not know the tea box; of the two salt shakers the goal has one."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    process = start_graph(
+        ROOT / "graphs" / "interactive.yaml",
+        *("world.suite=twins", "world.seed=28", "corrector.calibrate=false", "detector.labels=[salt_shaker]"),
+        folder=tmp_path,
+        options=["--page"],
+    )
+    try:
+        printed = read_until(process, "processes are ready")
+        (url,) = re.findall(r"page: (\S+)", printed)
+        with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
+            answers_about_the_unknown(page)
+            says_which_is_meant(page)
+    finally:
+        process.terminate()
+    run = finish(process, tmp_path, before=printed)
+    assert "COMPLETE" in run.output
+    assert [one.doubt.key for one in run.messages(Question)] == ["unknown", "unknown", "which salt_shaker", "unknown"]
+    assert [one.choice for one in run.messages(Answer)] == ["again", "leave", "salt_shaker_2", "leave"]
+    again = runner("replay", str(run.recording), "--verify")
+    assert "IDENTICAL" in again.communicate(timeout=300)[0] and again.returncode == 0
+
+
+def answers_about_the_unknown(page: Page) -> None:
+    """Looks once more, then goes on without it."""
+    page.get_by_label("Name of the scene").fill("shelf")
+    page.keyboard.press("Enter")
+    question = page.locator(".question")
+    expect(question).to_contain_text("There is something here that I do not know.")
+    expect(page.locator(".picture .name.marked")).to_have_text("? Unknown")
+    question.get_by_role("button", name="Look again").press("Enter")
+    expect(question).to_have_count(0)
+    question.get_by_role("button", name="Go on without it").press("Enter")
+    expect(page.locator(".notice")).to_contain_text("remembered: the salt shaker and the salt shaker 2.")
+
+
+def says_which_is_meant(page: Page) -> None:
+    page.locator(".cards summary").first.press("Enter")
+    page.get_by_role("button", name="Leave the salt shaker 2 out").press("Enter")
+    expect(page.locator(".cards")).to_contain_text("One object: the salt shaker")
+    page.get_by_role("button", name="Restore").press("Enter")
+    question = page.locator(".question")
+    expect(question).to_contain_text("Several objects could be the salt shaker.")
+    assert faults(page) == []
+    question.get_by_role("button", name="Salt shaker 2").press("Enter")
+    question.get_by_role("button", name="Go on without it").press("Enter")
+    expect(page.locator(".notice")).to_contain_text("“shelf” is restored")
 
 
 def edits(page: Page) -> None:

@@ -22,12 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.episodes import HEADER, Episode, row, totals
+from benchmarks.episodes import HEADER, Episode, messages, row, totals
 from benchmarks.ros2_lab import camera
 from benchmarks.ros2_lab.bench import Bench
 from benchmarks.ros2_lab.controllers import Arm, Gripper
 from benchmarks.ros2_lab.wire import Interfaces, Speaker, free_port, open_router
-from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from runner.testing import finish, read_until, start_graph
 from stages.messages import Goal, Outcome, Snapshot, Verdict
@@ -145,18 +144,13 @@ def run(seed: int, folder: Path, settings: Sequence[str]) -> tuple[Episode, dict
 def judged(path: Path, layouts: Layouts, *, seed: int, code: int, seconds: float, reason: str) -> Episode:
     """An episode as its recording tells it, and the lab's truth."""
     recording = Recording(path)
-    found: dict[str, list[Any]] = {kind.__name__: [] for kind in (Goal, Verdict, Outcome)}
-    for envelope in recording.envelopes():
-        if envelope.type in found:
-            kind = {"Goal": Goal, "Verdict": Verdict, "Outcome": Outcome}[envelope.type]
-            found[envelope.type].append(open_envelope(kind, envelope))
-    verdict, goal = (next(iter(reversed(found[name])), None) for name in ("Verdict", "Goal"))
+    verdict, goal = ([None, *messages(recording, Verdict)][-1], [None, *messages(recording, Goal)][-1])
+    outcomes = tuple(messages(recording, Outcome))
     judgement = Judgement(claimed=False)
     if verdict is not None:
         purposes = (f"goal {GOAL}", f"restore {GOAL}", "end")
         snapshots = [_snapshot(*one) for one in zip(purposes, layouts, strict=True)]
-        judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, found["Outcome"])
-    outcomes = tuple(found["Outcome"])
+        judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
     return Episode(seed, code, seconds, verdict, judgement, outcomes, recording.verdict.complete, reason, path)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from stages.devices.simulation import scene_model
 from stages.devices.suites import kinds
 from stages.devices.suites.suite import Rejected
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import pose
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
@@ -67,10 +68,7 @@ class Bench:
                 continue
             with self.lock:
                 self._present = tuple(layout)
-                for index, name in enumerate(self.names):
-                    away = np.eye(4)
-                    away[:3, 3] = _AWAY[0], _AWAY[1] * index, self.robot.floor + 0.1
-                    self._put(name, layout.get(name, away))
+                self._lay_out(layout)
             time.sleep(2.0)
             found = self.truth()
             if all(_stands(found[name], T) for name, T in layout.items()):
@@ -115,10 +113,13 @@ class Bench:
         gripper = self.robot.gripper
         for name, position in (self.robot.posture | gripper.posture(gripper.open_width)).items():
             self.data.joint(name).qpos[0] = position
+        self._lay_out({})
+
+    def _lay_out(self, layout: Mapping[str, Floats]) -> None:
+        """Puts objects where they are to stand (T_base_object by name), the others away."""
         for index, name in enumerate(self.names):
-            away = np.eye(4)
-            away[:3, 3] = _AWAY[0], _AWAY[1] * index, self.robot.floor + 0.1
-            self._put(name, away)
+            away = np.array([_AWAY[0], _AWAY[1] * index, self.robot.floor + 0.1])
+            self._put(name, layout.get(name, pose(np.eye(3), away)))
 
     def _put(self, name: str, T: Floats) -> None:
         quaternion = np.zeros(4)

@@ -17,7 +17,7 @@ from benchmarks.ros2_lab.bench import ROBOT
 from benchmarks.ros2_lab.wire import Interfaces, Speaker, stamp, transforms
 from stages.devices.simulated_camera import room
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3, pose
+from stages.geometry.poses import exp_so3, pose, random_direction
 from stages.perception.rendering.renderer import Camera, Item, Light, Lighting, Renderer
 from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -52,7 +52,10 @@ class Errors:
     def draw(seed: int) -> Errors:
         rng = np.random.default_rng([seed, 77])
         return Errors(
-            *(pose(exp_so3(turn * _unit(rng)), metres * _unit(rng)) for metres, turn in (_CALIBRATED, _REGISTERED))
+            *(
+                pose(exp_so3(turn * random_direction(rng)), metres * random_direction(rng))
+                for metres, turn in (_CALIBRATED, _REGISTERED)
+            )
         )
 
 
@@ -141,8 +144,3 @@ def _info(new: Interfaces, header: Any, K: Floats, size: tuple[int, int]) -> Any
         distortion_model="plumb_bob",
         **given,
     )
-
-
-def _unit(rng: np.random.Generator) -> Floats:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)

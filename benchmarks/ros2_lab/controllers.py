@@ -20,6 +20,8 @@ _PATH, _GOAL = -4, -5
 _STATES_STEPS, _TOOL_STEPS, _FEEDBACK_STEPS = 4, 16, 25
 """Steps of 2 ms: 125, 31 and 20 Hz."""
 _BRAKE, _RAMP, _STALL = 0.1, 0.6, 0.15
+_TREMBLE = 0.005
+"""Radians within which a finger stands."""
 _POSITION_NOISE, _EFFORT_NOISE = 1e-5, 0.1
 """Radians, newton metres."""
 _LIMIT, _LIMIT_STEPS = 0.98, 25
@@ -149,7 +151,8 @@ class Gripper:
         self._finger = model.joint(bench.robot.gripper.fingers[0])
         self._from = self._to = self._began = 0.0
         self._moving = self._canceled = False
-        self._still = 0.0
+        self._stands, self._since = 0.0, 0.0
+        """Where the finger stands, and since when."""
         self._server = Server(node, GRIPPER, GRIP, self._accept, self._cancel)
         bench.each.append(self._step)
 
@@ -158,7 +161,7 @@ class Gripper:
             if self._moving:
                 self._server.end(_ABORTED)
             self._from, self._to = self._commanded(), float(goal.command.position)
-            self._began, self._moving, self._canceled, self._still = self._bench.data.time, True, False, 0.0
+            self._began, self._moving, self._canceled = self._bench.data.time, True, False
         return True
 
     def _cancel(self) -> None:
@@ -173,9 +176,11 @@ class Gripper:
         data = self._bench.data
         share = min((data.time - self._began) / _RAMP, 1.0)
         data.ctrl[self._motors] = (self._from + (self._to - self._from) * share) * self._scale
-        rate, position = float(data.qvel[self._finger.dofadr[0]]), float(data.qpos[self._finger.qposadr[0]])
-        self._still = self._still + self._bench.model.opt.timestep if share == 1.0 and abs(rate) < 0.05 else 0.0
-        if self._canceled or self._still > _STALL:
+        position = float(data.qpos[self._finger.qposadr[0]])
+        # Not by its rate: a finger trembles on what it holds.
+        if share < 1.0 or abs(position - self._stands) > _TREMBLE:
+            self._stands, self._since = position, data.time
+        if self._canceled or data.time - self._since > _STALL:
             self._moving = False
             reached = abs(position - self._to) < 0.02
             status = _CANCELED if self._canceled else _SUCCEEDED

@@ -184,8 +184,10 @@ def _zenoh() -> Finding:
 
 def _recordings(folder: Path) -> Finding:
     beside = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not os.access(beside, os.W_OK):
-        return Finding("bad", "recordings", f"{beside} cannot be written", "runner up GRAPH --recordings DIR")
+    if not (beside.is_dir() and os.access(beside, os.W_OK)):
+        return Finding(
+            "bad", "recordings", f"{beside} is no folder that can be written", "runner up GRAPH --recordings DIR"
+        )
     free = shutil.disk_usage(beside).free
     remedy = "" if free >= LEAST_DISK else "remove old recordings, or runner up GRAPH --recordings DIR"
     return Finding(

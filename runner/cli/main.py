@@ -7,9 +7,8 @@ from collections.abc import Collection, Sequence
 
 from runner.cli.commands import Command, graphs, keys, live, machine, new, recordings, replay
 from runner.cli.completion import complete_and_exit
-from runner.contract import Refused
+from runner.contract import EXIT_REFUSED, Refused
 
-EXIT_REFUSED = 2
 EXIT_INTERRUPTED = 130
 
 

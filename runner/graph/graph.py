@@ -7,7 +7,8 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING as NONE
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -36,6 +37,9 @@ RESTARTS = 3
 QUEUE = 64
 NUMERICAL = ("numpy",)
 """The packages that compute where a graph names none."""
+
+
+ClassName = Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$(?!\n)", description="module:Class")]
 
 
 class Edge(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,7 +91,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class StageEntry(Limits, frozen=True, kw_only=True):
     """One stage of the graph."""
 
-    stage: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:\w+$(?!\n)", description="module:Class")]
+    stage: ClassName
     config: Annotated[dict[str, Any], Meta(description="Settings of the stage, as its Config declares them")] = {}
     inputs: Annotated[dict[str, str | Edge], Meta(description="Input port -> stage.port")] = {}
     replicas: Annotated[
@@ -106,17 +110,17 @@ class StageEntry(Limits, frozen=True, kw_only=True):
 class GraphKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is said of a graph beside its stages and hosts."""
 
-    name: Annotated[str, Meta(pattern=r"^[\w-]+$(?!\n)", description="Names the recordings")]
+    name: Annotated[str, Meta(pattern=r"^[\w-]+$(?!\n)", description="Letters, digits, _ and -: names the recordings")]
     seed: Annotated[int, Meta(description="Root of all random numbers")] = 0
-    view: Annotated[str | None, Meta(description="module:Class that draws the messages")] = None
+    view: Annotated[ClassName | None, Meta(description="module:Class that draws the messages")] = None
     story: Annotated[
-        str | None, Meta(description="module:Class that tells people on a page what happens and what they can do")
+        ClassName | None, Meta(description="module:Class that tells people on a page what happens and what they can do")
     ] = None
     page: Annotated[bool, Meta(description="Serve a page on every run, as `runner up --page` does")] = False
     listen: Annotated[
         str | None, Meta(description="Where others may listen, for example tcp/127.0.0.1:7447; only this user without")
     ] = None
-    score: Annotated[str | None, Meta(description="module:Class that says in numbers how well a run went")] = None
+    score: Annotated[ClassName | None, Meta(description="module:Class that says in numbers how well a run went")] = None
     tolerances: Annotated[
         str | None, Meta(description="module:NAME of the table of how far fields may be off on another machine")
     ] = None
@@ -401,20 +405,56 @@ def _read(kind: type[T], values: Any, document: Document, keys: Keys) -> T:
         if key not in known:
             raise Refused(f"{document.place(*keys, key)}: unknown key {key!r}{suggest(key, known)}")
     try:
-        return msgspec.convert(values, kind, dec_hook=_from_yaml)
+        return msgspec.convert(_completed(kind, values, document, keys), kind, dec_hook=_from_yaml)
     except Refused as refusal:
         raise Refused(f"{document.place(*keys)}: {refusal}") from None
     except msgspec.ValidationError as error:
         reason, _, inner = str(error).partition(" - at `$")
-        place = document.place(*keys, *re.findall(r"\w+", inner))
-        raise Refused(f"{place}: {reason}{_choices(kind, inner)}") from None
+        names = re.findall(r"\w+", inner)
+        raise Refused(
+            f"{document.place(*keys, *names)}: {_reason(reason, values, names)}{_valid(kind, names)}"
+        ) from None
 
 
-def _choices(kind: Any, place: str) -> str:
-    """``; valid: a, b`` where the field at ``place`` takes one of a few words."""
-    hint = get_type_hints(kind, include_extras=True).get(place.strip(".`"))
-    words = [str(word) for part in _flat(hint) if get_origin(part) is Literal for word in get_args(part)]
-    return f"; valid: {', '.join(words)}" if words else ""
+def _completed(kind: Any, values: dict[str, Any], document: Document, keys: Keys) -> dict[str, Any]:
+    """The settings, those in a group that has a default of its own with the rest of that default.
+
+    msgspec ignores keys that a dataclass does not have: those of the settings are checked, and here those of a group.
+    """
+    if not is_dataclass(kind):
+        return values
+    completed = dict(values)
+    for one in fields(kind):
+        given, default = values.get(one.name), None if one.default_factory is NONE else one.default_factory()
+        if isinstance(given, dict) and is_dataclass(default):
+            rest = {part.name: getattr(default, part.name) for part in fields(default)}
+            for key in given:
+                if key not in rest:
+                    place = document.place(*keys, one.name, key)
+                    raise Refused(f"{place}: unknown key {key!r}{suggest(key, rest)}")
+            completed[one.name] = rest | given
+    return completed
+
+
+def _reason(reason: str, value: Any, names: Iterable[str]) -> str:
+    """What msgspec says of the value at a place, with the value itself."""
+    for name in names:
+        value = value[int(name)] if isinstance(value, list) else value[name]
+    if " matching regex " in reason:
+        return f"{value!r} does not fit"
+    return f"{reason.partition(', got')[0]}, got {value!r}" if reason.startswith("Expected") else reason
+
+
+def _valid(hint: Any, names: Iterable[str]) -> str:
+    """``; valid: a, b`` where what is at a place takes one of a few words, and what the graph's keys say of it."""
+    for name in names:
+        hint = get_type_hints(hint, include_extras=True).get(name, hint) if isinstance(hint, type) else hint
+    parts = list(_flat(hint))
+    words = [str(word) for part in parts if get_origin(part) is Literal for word in get_args(part)]
+    words += ["a number"] if words and (int in parts or float in parts) else []
+    about = next((part.description for part in parts if isinstance(part, Meta) and part.description), None)
+    valid = f"; valid: {', '.join(words)}" if words else ""
+    return f"{valid} ({about})" if about else valid
 
 
 def _flat(hint: Any) -> Iterator[Any]:

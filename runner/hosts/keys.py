@@ -46,14 +46,17 @@ def make_keys(folder: Path, hosts: Sequence[Host]) -> None:
             f"{folder}: there are keys already and they are not overwritten; "
             f"valid: another folder, or `runner keys add --keys {folder} NAME=ADDRESS` for one more host"
         )
+    owners = [*hosts, Host(READER, "localhost")]
+    _refuse_taken(folder, owners)
     authority = _sign(AUTHORITY, days=CA_DAYS, extensions=_AUTHORITY)
     _write(folder, {"ca.pem": _pem(authority), "ca-key.pem": _key_pem(authority)})
-    _add(folder, authority, [*hosts, Host(READER, "localhost")])
+    _add(folder, authority, owners)
 
 
 def add_keys(folder: Path, hosts: Sequence[Host]) -> None:
     """Makes certificates with the authority that is there; raises Refused where one would be overwritten."""
     authority = _read_certificate(folder / "ca.pem"), _read_key(folder / "ca-key.pem")
+    _refuse_taken(folder, hosts)
     _add(folder, authority, hosts)
 
 
@@ -116,10 +119,16 @@ def _sign(name: str, *, days: int, extensions: list[Extension], by: Signed | Non
     return builder.sign(issuer_key, hashes.SHA256()), key
 
 
+def _refuse_taken(folder: Path, hosts: Sequence[Host]) -> None:
+    names = [host.name for host in hosts]
+    for name in names:
+        if (folder / name).exists():
+            raise Refused(f"{folder / name}: is there already and is not overwritten; remove it to make another")
+        if names.count(name) > 1:
+            raise Refused(f"{name}: is named twice; valid: names that differ, and {READER} is who may only listen")
+
+
 def _add(folder: Path, authority: Signed, hosts: Sequence[Host]) -> None:
-    taken = [host.name for host in hosts if (folder / host.name).exists()]
-    if taken:
-        raise Refused(f"{folder / taken[0]}: is there already and is not overwritten; remove it to make another")
     for host in hosts:
         signed = _sign(host.name, days=HOST_DAYS, extensions=_extensions(host), by=authority)
         _write(folder / host.name, {"ca.pem": _pem(authority), "cert.pem": _pem(signed), "key.pem": _key_pem(signed)})

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from runner.contract import Refused
-from runner.graph.document import suggest
 from runner.inspect.info import seconds
 from runner.message.codec import Step
 from runner.recording.recording import Recording
@@ -41,10 +39,16 @@ class Causes:
         return path[::-1]
 
     def tree_of(self, id: str) -> Iterator[str]:
-        """The tree of causes as lines: depth first with a stack of its own, for chains may be longer than Python's."""
+        """The tree of causes as lines: each message with the queueing, transport and computing of its step.
+
+        It ends where the message's lineage starts, which for what is perceived is the look. What leads to a message
+        twice is shown once. Raises Refused where nothing in the recording speaks of the message.
+        """
+        if id not in self._steps:
+            self._recording.require(id)
         root = self._root_of(id)
         seen: set[str] = set()
-        stack = [("", "", "", id)]
+        stack = [("", "", "", id)]  # chains may be longer than Python's
         while stack:
             lead, branch, port, current = stack.pop()
             repeated = current in seen
@@ -80,15 +84,3 @@ def last_recorded(recording: Recording, ids: Iterable[str]) -> str | None:
     """The message that was recorded last; None where there are none."""
     messages = recording.messages
     return max(ids, key=lambda id: messages[id].log_time_ns if id in messages else 0, default=None)
-
-
-def tree(recording: Recording, id: str) -> list[str]:
-    """The tree of causes as lines: each message with the queueing, transport and computing of its step.
-
-    It ends where the message's lineage starts, which for what is perceived is the look. What leads to a message twice
-    is shown once. Raises Refused where nothing in the recording speaks of the message.
-    """
-    causes = Causes(recording)
-    if id not in recording.messages and causes.step_of(id) is None:
-        raise Refused(f"{recording.path}: no message {id!r}{suggest(id, recording.messages)}")
-    return list(causes.tree_of(id))

@@ -111,7 +111,7 @@ class StageTimes:
         times.computed.note(step.computed_ns)
         times.travelled.note(step.travelled_ns)
         times.waited.note(step.waited_ns)
-        times.ended_badly += step.outcome != "done"
+        times.ended_badly += step.outcome == "failed"
 
     def lines(self) -> list[str]:
         """A table, one row per stage."""
@@ -148,7 +148,7 @@ class _Times:
 def _complaints(recording: Recording) -> Iterator[str]:
     yield from (f"damage at {damage}" for damage in recording.damage)
     yield from (f"missing {id}" for id in recording.verdict.missing)
-    yield from (f"lost {one.stage}/{one.replica}/{one.incarnation}: {one.reason}" for one in recording.lost)
+    yield from (f"lost {one.process.path}: {one.reason}" for one in recording.lost)
     if recording.repeated:
         yield f"{len(recording.repeated)} messages were sent again after a restart"
     for line in recording.log:

@@ -27,9 +27,10 @@ def log_lines(path: Path, *, follow: bool) -> Iterator[LogLine]:
 
 def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:
     """(process, line) of what the processes of a stage wrote to their output: tracebacks, warnings."""
-    for path in sorted((recording.with_suffix("") / "log").glob(f"{stage}-*.txt")):
-        for line in path.read_text(errors="replace").splitlines():
-            yield path.stem, line
+    for path in sorted((recording.with_suffix("") / "log").glob("*.txt")):
+        if path.stem.rpartition("-")[0] == stage:
+            for line in path.read_text(errors="replace").splitlines():
+                yield path.stem, line
 
 
 def newest_recording(folder: Path) -> Path:

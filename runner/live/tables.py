@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from runner.contract import Refused
+from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.document import suggest
 from runner.inspect.echo import lines_of
 from runner.inspect.info import byte_count, seconds, table
+from runner.inspect.logs import printed_lines
 from runner.live.live import Header
 from runner.message.codec import LogLine
 from runner.supervise.calls import CommandType, Progress
@@ -22,7 +23,6 @@ from runner.supervise.registry import Entry
 from runner.supervise.status import Flow, ProcessStatus, RunStatus
 from runner.terminal import Terminal
 
-EXIT_REFUSED = 2
 SHOWN_LINES = 24
 """Of an answer."""
 
@@ -120,8 +120,7 @@ def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> 
             began = began or line.time_ns
             name = f"{line.stage}.{line.replica}" if line.replica else line.stage
             terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    printed = (recording.with_suffix("") / "log").glob(f"{stage}-*.txt")
-    if stage is not None and stage not in seen and not any(printed):
+    if stage is not None and stage not in seen and not any(printed_lines(recording, stage)):
         raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
 
 
@@ -139,7 +138,7 @@ def commands_text(commands: Sequence[CommandType], stage: str | None) -> str:
     chosen = [command for command in commands if stage in (None, command.stage)]
     if not chosen:
         stages = {command.stage for command in commands}
-        raise Refused(f"{stage or 'this graph'} has no commands{suggest(stage or '', stages)}")
+        raise Refused(f"{'this graph' if stage is None else repr(stage)} has no commands{suggest(stage or '', stages)}")
     return "\n".join(line for command in chosen for line in _command_lines(command))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -14,8 +14,7 @@ GATEWAY = "gateway"
 """Where tools and strangers listen."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Process:
+class Process(NamedTuple):
     """One process of the graph; each restart is another incarnation."""
 
     stage: str
@@ -29,6 +28,11 @@ class Process:
         if match is None:
             raise Refused(f"names no process: {key[-60:]}; valid: STAGE/REPLICA/INCARNATION")
         return Process(match[1], int(match[2]), int(match[3]))
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """(stage, replica): what its successors are too."""
+        return self[:2]
 
     @property
     def path(self) -> str:

@@ -19,7 +19,7 @@ SHOWN = 10
 class Refusals:
     """Counts what one process refuses, from any thread."""
 
-    def __init__(self, show: Callable[[str], None]) -> None:
+    def __init__(self, show: Callable[[str], object]) -> None:
         self.count = 0
         self._show = show
         self._counting = threading.Lock()

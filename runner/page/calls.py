@@ -33,8 +33,8 @@ class Call(msgspec.Struct):
 class PageCalls:
     """The newest calls of all pages."""
 
-    def __init__(self, live: Live, changed: Callable[[list[Call]], object]) -> None:
-        """``changed`` is called, on another thread, with all that are remembered."""
+    def __init__(self, live: Live, changed: Callable[[], object]) -> None:
+        """``changed`` is called, on another thread, when there is news of one."""
         self._live = live
         self._changed = changed
         self._calls: list[Call] = []
@@ -47,6 +47,11 @@ class PageCalls:
         threading.Thread(target=self._follow, args=(call,), name=call.id, daemon=True).start()
         return call.id
 
+    def told(self, say: Callable[[str], str]) -> list[Call]:
+        """All that are remembered, as they are now; ``say`` puts into words why one was refused."""
+        with self._lock:
+            return [msgspec.structs.replace(call, refused=say(call.refused)) for call in self._calls]
+
     def _follow(self, call: Call) -> None:
         try:
             for progress in self._live.follow(call.id):
@@ -56,8 +61,8 @@ class PageCalls:
                     call.answer = (
                         list(itertools.islice(lines_of(progress.answer), SHOWN_LINES)) if progress.answer else []
                     )
-                    self._changed(self._calls)
+                self._changed()
         except Refused as refusal:
             with self._lock:
                 call.done, call.refused = True, str(refusal)
-                self._changed(self._calls)
+            self._changed()

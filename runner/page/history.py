@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Metadata
 
-from runner.recording.container import is_being_written
+from runner.contract import Refused
+from runner.recording.container import Container, is_being_written
 from runner.recording.recording import RUN, VERDICT
 
 
@@ -33,12 +36,24 @@ def past_runs(folder: Path) -> list[PastRun]:
     return sorted(found, key=lambda run: run.started, reverse=True)
 
 
+def _begun(records: Container) -> tuple[str, float]:
+    """The graph and the start of a recording that has no end yet; empty and 0 where it has no beginning either."""
+    graph = ""
+    with contextlib.suppress(Refused):
+        for record in records:
+            if not isinstance(record, Metadata):
+                return graph, record.message.log_time * 1e-9
+            graph = record.metadata.get("name", "") if record.name == RUN else graph
+    return graph, 0.0
+
+
 def _read(path: Path) -> PastRun | None:
     try:
         with path.open("rb") as file:
             size, modified = path.stat().st_size, path.stat().st_mtime
             if is_being_written(file):
-                return PastRun(path.stem, "", modified, 0.0, size, "", True)
+                graph, started = _begun(Container(file, path.name))
+                return PastRun(path.stem, graph, started or modified, 0.0, size, "", True)
             reader = make_reader(file)
             summary = reader.get_summary()
             said = {record.name: record.metadata for record in reader.iter_metadata()}

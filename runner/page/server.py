@@ -82,7 +82,7 @@ class Page:
         self._ended = threading.Event()
         self._ready = False
         self._watch = Watch(Path(entry.recording), partial(self._soon, self._news.set), self._ended.is_set)
-        self._calls = PageCalls(live, lambda calls: self._soon(partial(self._feed.put, "calls", list(calls))))
+        self._calls = PageCalls(live, partial(self._soon, self._news.set))
 
     @property
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
@@ -143,7 +143,7 @@ class Page:
             return ("run",)
         shown = self._shown[socket]
         more = ("status", "log", "commands") if shown.view == "engineer" else ()
-        return ("run", "calls", f"told {shown.language}", *more)
+        return ("run", f"calls {shown.language}", f"told {shown.language}", *more)
 
     @property
     def _an_engineer_looks(self) -> bool:
@@ -154,16 +154,19 @@ class Page:
         self._looks.set() if self._shown else self._looks.clear()
 
     async def _tell(self) -> None:
-        """Tells the story in every language that a page shows, and the log, once there is news."""
+        """Tells all that can change in every language that a page shows, once there is news and all is read."""
         while True:
             await self._news.wait()
             self._news.clear()
+            if not self._watch.caught_up:  # soon there is news again; what has passed meanwhile is in the history
+                continue
             languages: set[Language] = {shown.language for shown in self._shown.values()}
             for language in languages:
                 told = await run_in_threadpool(self._watch.tell, language)
                 await run_in_threadpool(self._keep_photos, told.photos)
                 self._files = {file.key: file.data.tobytes() for file in told.files}
                 self._feed.put(f"told {language}", told)
+                self._feed.put(f"calls {language}", self._calls.told(partial(self._watch.say, language=language)))
             if self._an_engineer_looks:
                 self._feed.put("log", list(self._watch.lines))
             await asyncio.sleep(0.05)
@@ -210,12 +213,13 @@ class Page:
     # ------------------------------------------------------------------------------------------ what is asked
 
     async def _call(self, request: Request) -> Response:
-        """Calls a command, as `runner call` does; 422 with the reason where it is refused."""
+        """Calls a command, as `runner call` does; 422 with the reason, in the page's language, where it is refused."""
         try:
             asked = msgspec.json.decode(await request.body(), type=CallRequest)
             return PlainTextResponse(await run_in_threadpool(self._calls.call, asked))
         except (Refused, msgspec.MsgspecError) as refusal:
-            return PlainTextResponse(str(refusal), 422)
+            language = "de" if request.headers.get("accept-language") == "de" else "en"
+            return PlainTextResponse(self._watch.say(str(refusal), language), 422)
 
     async def _runs(self, _: Request) -> Response:
         found = await run_in_threadpool(past_runs, self._folder)
@@ -323,7 +327,13 @@ def serve(entry: Entry, *, address: str, port: int, token: str) -> None:
 
     app = Guard(Starlette(lifespan=living), token, hosts)
     config = uvicorn.Config(
-        app, log_level="warning", ws="websockets-sansio", lifespan="on", timeout_graceful_shutdown=CLOSE_SECONDS
+        app,
+        log_level="warning",
+        ws="websockets-sansio",
+        ws_per_message_deflate=False,  # what is sent to every page would be compressed for each anew
+        lifespan="on",
+        proxy_headers=False,
+        timeout_graceful_shutdown=CLOSE_SECONDS,
     )
     server = uvicorn.Server(config)
     with Live(entry) as live:

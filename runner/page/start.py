@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import threading
@@ -11,7 +12,7 @@ from collections.abc import Callable, Generator
 from importlib.util import find_spec
 
 from runner.contract import Refused
-from runner.process.children import bound
+from runner.process.children import ENVIRONMENT, bound
 
 NEEDED = ("PIL", "starlette", "uvicorn", "websockets")
 
@@ -23,15 +24,22 @@ def require_page() -> None:
 
 
 @contextlib.contextmanager
-def page_beside(run: str, say: Callable[[str], object]) -> Generator[None]:
+def page_beside(run: str, say: Callable[[str], object]) -> Generator[subprocess.Popen[str]]:
     """Serves the page of a run meanwhile; ``say`` gets what it prints, its address above all."""
     command = bound([sys.executable, "-m", "runner.cli", "page", "--run", run])
-    page = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0)
+    page = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        process_group=0,
+        env={**os.environ, **ENVIRONMENT},
+    )
     assert page.stdout is not None
     lines = map(str.rstrip, page.stdout)
     threading.Thread(target=lambda: deque(map(say, lines), maxlen=0), name="page", daemon=True).start()
     try:
-        yield
+        yield page
     finally:
         page.terminate()
         page.wait()

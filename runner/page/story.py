@@ -277,6 +277,10 @@ class Story(Protocol):
         """What there is to say, in a language."""
         ...
 
+    def say(self, refusal: str, language: Language) -> str:
+        """Why a stage refused a call, in the words of people; what is not known stays as it was said."""
+        ...
+
 
 def load_story(graph: Graph) -> Story | None:
     """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""

@@ -30,7 +30,7 @@ FILES = {
 _SERVES = "import rerun, sys; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); sys.stdin.read()"
 """The viewer is inside of Rerun's library, which gives it out over HTTP alone."""
 _SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
-START_SECONDS = 20.0
+START_SECONDS = 60.0
 PIECE_BYTES = 1 << 18
 
 

@@ -43,13 +43,13 @@ class Watch:
         self.began_ns = 0
         """When the first record was made, nanoseconds since the epoch."""
         self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
+        self.caught_up = False
+        """Whether all was read that there is: before, what is sent now would be told too soon."""
         self._recording = recording
         self._changed = changed
         self._stopped = stopped
         self._looked_at = threading.Event()
         self._telling = threading.Lock()
-        self._caught_up = False
-        """Whether all was read that there is: before, what is sent now would be told too soon."""
         self._taken = Recent[str, None](KEPT_IDS)
         """Ids of what was heard or read: each may come twice."""
         self._story: Story | None = None
@@ -64,7 +64,7 @@ class Watch:
     def look(self, somebody: bool) -> None:
         """Goes on where somebody looks, and rests where nobody does."""
         self._looked_at.set() if somebody else self._looked_at.clear()
-        self._caught_up &= somebody
+        self.caught_up &= somebody
 
     def listen(self, entry: Run) -> None:
         """Hears what is sent until nobody looks, or the run does not answer any more."""
@@ -72,7 +72,7 @@ class Watch:
             time.sleep(POLL_SECONDS)
         with contextlib.suppress(Refused), Live(entry) as live:
             for packets in live.overheard(self._heard):
-                for packet in packets if self._caught_up else ():
+                for packet in packets if self.caught_up else ():
                     self._hear(self._heard[packet.key.removeprefix("m/")], packet.payload, time.time_ns())
                 if not self._looked_at.is_set() or self._stopped():
                     return
@@ -81,6 +81,10 @@ class Watch:
         """What there is to say now."""
         with self._telling:
             return self._story.tell(language) if self._story else NOTHING
+
+    def say(self, refusal: str, language: Language) -> str:
+        """Why a stage refused a call, in the words of a language where somebody tells the story."""
+        return self._story.say(refusal, language) if self._story and refusal else refusal
 
     def read(self) -> None:
         """Reads until the run ends, or as far as it is there once it is to stop."""
@@ -98,7 +102,9 @@ class Watch:
         return self._stopped()
 
     def _at_end(self) -> bool:
-        self._caught_up = self._prepared and self._looked_at.is_set()
+        if not self.caught_up and self._prepared and self._looked_at.is_set():
+            self.caught_up = True
+            self._changed()
         return self._rest()
 
     def _take(self, record: Entry | Metadata) -> None:

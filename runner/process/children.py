@@ -90,9 +90,7 @@ def end_process(handle: Handle, seconds: float) -> None:
 class Spawned(subprocess.Popen[bytes]):
     """A process in a group of its own."""
 
-    def signal_group(self, signum: int) -> None:
-        """Signals it and everything it has started, also once it has gone."""
-        signal_group(self.pid, signum)
+    signal_group = Handle.signal_group
 
 
 def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") -> Spawned:

@@ -16,7 +16,7 @@ PATIENCE_SECONDS = 30.0
 
 Publish = Callable[[str, bytes | bytearray], None]
 """Sends a payload under a key."""
-Warn = Callable[[str], None]
+Warn = Callable[[str], object]
 
 
 class Stopped(Exception):
@@ -137,10 +137,10 @@ class Delivery:
     def appeared(self, process: Process) -> None:
         """Takes note of a consumer's process that is there."""
         with self._changed:
-            newest = self._newest.get((process.stage, process.replica))
+            newest = self._newest.get(process.place)
             if newest is not None and process <= newest:
                 return
-            self._newest[process.stage, process.replica] = process
+            self._newest[process.place] = process
             for edge in self._edges_to(process.stage):
                 edge.appeared(process.replica)
         self._deal(self._edges_to(process.stage))
@@ -148,7 +148,7 @@ class Delivery:
     def lost(self, process: Process) -> None:
         """Takes note of a consumer's process that is dead."""
         with self._changed:
-            if self._newest.get((process.stage, process.replica), process) <= process:
+            if self._newest.get(process.place, process) <= process:
                 for edge in self._edges_to(process.stage):
                     edge.lost(process.replica)
         self._deal(self._edges_to(process.stage))

@@ -55,15 +55,8 @@ class Heart:
                 return
 
     def _pulse(self) -> Pulse:
-        own = self._process
-        return Pulse(
-            stage=own.stage,
-            replica=own.replica,
-            incarnation=own.incarnation,
-            cpu_ns=time.process_time_ns(),
-            memory_bytes=self._facts.memory_info().rss,
-            **self._say(),
-        )
+        memory_bytes = self._facts.memory_info().rss
+        return Pulse(*self._process, cpu_ns=time.process_time_ns(), memory_bytes=memory_bytes, **self._say())
 
 
 class Watch:

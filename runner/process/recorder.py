@@ -16,7 +16,7 @@ from typing import cast
 
 import msgspec
 
-from runner.contract import Refused
+from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
@@ -38,7 +38,6 @@ ORPHANED_SECONDS = 5.0
 LAST_RESORT_SECONDS = 30
 """After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
-EXIT_REFUSED = 2
 REST_SECONDS = 0.005
 """What may come together before the recorder looks again."""
 UNSEEN_SECONDS = 0.5
@@ -168,7 +167,7 @@ class Recorder:
         if process not in self._presence.living:
             return False
         sources = self._redelivery.sources_of(process.stage)
-        publishers = {(one.stage, one.replica) for one in self._presence.living if one.stage in sources}
+        publishers = {one.place for one in self._presence.living if one.stage in sources}
         publishers |= {(SUPERVISOR, 0)} & {(source, 0) for source in sources}
         return publishers <= self._lagging[process]
 
@@ -209,7 +208,7 @@ class Recorder:
             return
         with self._changing:
             lagging = process in self._lagging
-            self._lagging.setdefault(process, set()).add((publisher.stage, publisher.replica))
+            self._lagging.setdefault(process, set()).add(publisher.place)
         if not lagging and process in self._presence.living:
             self._catch_up(process)  # once more, for what this one has sent meanwhile
 
@@ -245,8 +244,7 @@ class Recorder:
 
     def _complain(self, text: str) -> None:
         """Shows and records a line."""
-        line = LogLine(RECORDER, 0, "error", text, time.time_ns())
-        self._bus.publish(f"l/{RECORDER}", pack(line))
+        line = self._bus.log(text, "error")
         self._writer.put(line, pack(line))
 
 

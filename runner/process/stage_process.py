@@ -15,17 +15,18 @@ from typing import Any
 
 import msgspec
 
-from runner.contract import Level, Refused
+from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.graph import Route, node_from_entry
 from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.message import codec
-from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, LogLine, Lost, Outcome, Step, answered
+from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, Lost, Outcome, Step, answered
 from runner.message.ids import MessageId, Recent
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, explain_death, volunteer_for_oom
 from runner.process.delivery import Delivery, Stopped
+from runner.process.forks import EXIT_FAILED
 from runner.process.health import Heart
 from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
 from runner.process.past import bring_back, past_of
@@ -39,8 +40,6 @@ SWITCH_SECONDS = 0.0005
 CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
 """How long it may take at the end until the recorder says that it has a step."""
-EXIT_FAILED = 1
-EXIT_REFUSED = 2
 
 
 class Assignment(msgspec.Struct, frozen=True):
@@ -95,7 +94,7 @@ class StageProcess:
             task.stage,
             task.routes,
             self._bus.publish,
-            partial(self._log, level="warning"),
+            partial(self._bus.log, level="warning"),
             stopping=self._stopping.is_set,
             undone=task.undone,
         )
@@ -105,7 +104,7 @@ class StageProcess:
             self._stage,
             seed=task.seed,
             directory=Path(task.directory),
-            log=self._log,
+            log=self._bus.log,
             numbers=task.numbers,
         )
         self._arrived = Recent[tuple[str, str], None]()
@@ -113,7 +112,7 @@ class StageProcess:
         self._arrived.update(dict.fromkeys(one for one in task.consumed if not self._node.keeps(one[0])))
         self._left: list[tuple[str, str]] = []
         """(port, id) of what was refused since the last step."""
-        self._refusals = Refusals(partial(self._log, level="error"))
+        self._refusals = Refusals(partial(self._bus.log, level="error"))
         self._mailbox = Mailbox(self._node)
         self._catching_up = threading.Lock()
         self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
@@ -195,7 +194,7 @@ class StageProcess:
 
     def _on_presence(self, process: Process, present: bool) -> None:
         own = self._process
-        if present and process > own and (process.stage, process.replica) == (own.stage, own.replica):
+        if present and process > own and process.place == own.place:
             print(f"cut off meanwhile, and replaced by incarnation {process.incarnation}", file=sys.stderr, flush=True)
             os._exit(EXIT_FAILED)
         self._presence.update(process, present)
@@ -337,7 +336,7 @@ class StageProcess:
         if not handler.is_command:
             record.outcome = "failed"
             raise refusal
-        self._log(str(refusal), "warning")
+        self._bus.log(str(refusal), "warning")
 
     def _advance(self, handler: Handler) -> Iterator[bool]:
         """Sends the next message of the source each time it is advanced, if it has one; every message is a step."""
@@ -382,19 +381,13 @@ class StageProcess:
             self._say_what_is_left()
             left = (*self._inbox.left(), *self._parts.left())
         left = (*self._left, *self._inbox.take_unused(), *left)
-        own, now_ns = self._process, time.time_ns()
-        self._publish_step(
-            Step(own.stage, own.replica, own.incarnation, self._steps, "", (), (), now_ns, 0, 0, 0, "ended", left=left)
-        )
+        end = Step(*self._process, self._steps, "", (), (), time.time_ns(), 0, 0, 0, outcome="ended", left=left)
+        self._publish_step(end)
 
     def _say_what_is_left(self) -> None:
         """Records what was never worked on."""
         for handler, lineage, lacking in self._inbox.incomplete():
-            self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-
-    def _log(self, text: str, level: Level) -> None:
-        line = LogLine(self._process.stage, self._process.replica, level, text, time.time_ns())
-        self._bus.publish(f"l/{self._process.stage}", codec.pack(line))
+            self._bus.log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
 
 
 class _Record:
@@ -444,9 +437,7 @@ class _Record:
         arrivals = self._ready.arrivals
         last = max(arrivals, key=lambda arrival: arrival.arrived_ns, default=None)
         return Step(
-            stage=process.stage,
-            replica=process.replica,
-            incarnation=process.incarnation,
+            *process,
             number=number,
             handler=self._ready.handler.name,
             consumed=tuple((arrival.port.name, arrival.envelope.id) for arrival in arrivals),

@@ -16,7 +16,7 @@ from runner.message import codec
 from runner.message.codec import Draft, Envelope
 from runner.message.ids import MessageId
 
-Log = Callable[[str, Level], None]
+Log = Callable[[str, Level], object]
 """Takes one line of a stage's log."""
 
 

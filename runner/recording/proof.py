@@ -165,7 +165,7 @@ class Proof:
             self._excused[port] |= self._recorded[port] - self._emitted[port]
 
     def _process(self, of: Step | Lost) -> _Process:
-        return self._processes.setdefault((of.stage, of.replica), defaultdict(_Process))[of.incarnation]
+        return self._processes.setdefault(of.process.place, defaultdict(_Process))[of.incarnation]
 
     def _want(self, port: str, number: int) -> None:
         if number not in self._recorded[port]:
@@ -281,7 +281,7 @@ def _name(topic: str, record: Record) -> str:
         case str():
             return record
         case Step():
-            return f"step {record.number} of {record.stage}/{record.replica}/{record.incarnation}"
+            return f"step {record.number} of {record.process.path}"
         case _:
             return f"a record of {topic}"
 

@@ -31,6 +31,18 @@ FIRST_NUMERICAL = (
     "torch",
 )
 """The packages that compute, of every recording that was made before graphs named theirs."""
+_SETTINGS = (
+    "ATEN_CPU_CAPABILITY",
+    "GLIBC_TUNABLES",
+    "MKL_CBWR",
+    "MKL_ENABLE_INSTRUCTIONS",
+    "NPY_DISABLE_CPU_FEATURES",
+    "NUMBA_CPU_FEATURES",
+    "NUMBA_CPU_NAME",
+    "ONEDNN_MAX_CPU_ISA",
+    "OPENBLAS_CORETYPE",
+    "OPENCV_CPU_DISABLE",
+)
 HASHED_BYTES = 64 * 2**20
 """Larger files and folders are named without a hash."""
 HASHED_FILES = 1000
@@ -102,7 +114,7 @@ def machine() -> dict[str, str]:
     blas = cast("dict[str, Any]", np.show_config(mode="dicts"))["Build Dependencies"]["blas"]
     return {
         "processor": _processor("model name") or platform.processor(),
-        "vectors": " ".join(flag for flag in _processor("flags").split() if flag.startswith(("avx", "fma", "sse4"))),
+        "vectors": " ".join([*_vector_units(), *_settings()]),
         "system": platform.platform(),
         "libc": " ".join(platform.libc_ver()),
         "python": platform.python_version(),
@@ -124,6 +136,15 @@ def _processor(key: str) -> str:
     except OSError:
         return ""
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
+
+
+def _vector_units() -> Iterator[str]:
+    return (flag for flag in _processor("flags").split() if flag.startswith(("avx", "fma", "sse4")))
+
+
+def _settings() -> Iterator[str]:
+    """What the environment tells the numerical libraries to take the processor for."""
+    return (f"{name}={os.environ[name]}" for name in _SETTINGS if name in os.environ)
 
 
 def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:

@@ -13,6 +13,7 @@ import msgspec
 from mcap.records import Metadata
 
 from runner.contract import Message, Refused
+from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open_envelope, unpack
 from runner.message.ids import IdText, MessageId
@@ -265,6 +266,21 @@ class Recording:
                         sealed = unpack(Envelope, entry.message.data)
                         envelopes.setdefault(sealed.id, sealed)
         return envelopes
+
+    def require(self, id: str) -> None:
+        """Raises Refused, naming the nearest, where a message is not recorded."""
+        if id in self.messages:
+            return
+        wanted = MessageId.of(id)
+        same_port = sorted(other for other in map(MessageId.of, self.messages) if other.topic == wanted.topic)
+        if not same_port:
+            ports = {id.partition("#")[0] for id in self.messages}
+            raise Refused(f"{self.path}: no message {id!r}{suggest(id.partition('#')[0], ports)}")
+        near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
+        raise Refused(
+            f"{self.path}: no message {id!r}; the nearest: {', '.join(map(str, sorted(near)))} "
+            f"(of {same_port[0]} to #{same_port[-1].sequence})"
+        )
 
     def require_messages(self) -> None:
         """Raises Refused where the run was asked to record none."""

@@ -33,13 +33,10 @@ def _copy(recording: Recording, output: IO[bytes]) -> None:
     verdict = recording.verdict
     writer = Writer(output, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(profile=PROFILE)
-    channels: dict[int, int] = {}
+    channels = {number: _register(recording.container, number, writer) for number in recording.container.channels}
     for record in recording.records():
         if isinstance(record, Entry):
-            message = record.message
-            if message.channel_id not in channels:
-                channels[message.channel_id] = _register(recording.container, message.channel_id, writer)
-            channel = channels[message.channel_id]
+            message, channel = record.message, channels[record.message.channel_id]
             writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
         elif record.name != VERDICT:
             writer.add_metadata(record.name, record.metadata)

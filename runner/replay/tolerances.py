@@ -21,16 +21,16 @@ def compare_origin(recording: Recording) -> tuple[bool, list[str]]:
     same = provenance.fingerprint(before, then, names) == provenance.fingerprint(here, packages, names)
     lines: list[str] = []
     if not same:
-        computing = [
-            *changes(then, packages, names),
-            *changes(before, here, [aspect for aspect in before if aspect != "system"]),
-        ]
-        lines.append(f"FINGERPRINT DIFFERS: {'; '.join(computing)}: tolerances apply where a graph has them")
+        aspects = (aspect for aspect in before if aspect != "system")
+        computing = "; ".join((*changes(then, packages, names), *changes(before, here, aspects)))
+        lines.append(f"FINGERPRINT DIFFERS: {computing}: tolerances apply where a graph has them")
     others = (name for name in then if name not in names)
-    source = {"source": recording.run.get("revision") or "unknown"}
-    runner = {"runner": recording.run["runner"]} if "runner" in recording.run else {}
-    now = {"source": provenance.revision(recording.graph) or "unknown", "runner": provenance.runner_version()}
-    if other := [*changes(then, packages, others), *changes({**source, **runner}, now, [*source, *runner])]:
+    source = {"source": provenance.revision(recording.graph) or "unknown", "runner": provenance.runner_version()}
+    was = {
+        "source": recording.run.get("revision") or "unknown",
+        "runner": recording.run.get("runner", source["runner"]),
+    }
+    if other := [*changes(then, packages, others), *changes(was, source, source)]:
         lines.append(f"changed since the recording: {'; '.join(other)}")
     return same, lines
 

@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 
 from runner.contract import Message, Refused, Stage
-from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
 from runner.inspect.compare import clipped, envelope_differences
@@ -24,6 +23,7 @@ from runner.inspect.echo import array_text
 from runner.inspect.info import table
 from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
+from runner.message.packet import Process
 from runner.process.step import arguments_of
 from runner.recording.recording import Recording, kind_of, opened, replicated
 from runner.replay.expression import Expression
@@ -57,7 +57,8 @@ def travel(
         raise Refused(f"{path}: holds no messages: there is none to stop at")
     graph = change(recording, assignments, swaps)
     if until is not None:
-        start = _existing(recording, until)
+        recording.require(until)
+        start = until
     elif condition is not None:
         start = first_match(recording, graph, condition)
     else:
@@ -69,23 +70,6 @@ def travel(
     with tempfile.TemporaryDirectory() as folder:
         Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt)
     return 0
-
-
-def _existing(recording: Recording, id: str) -> str:
-    if id in recording.messages:
-        return id
-    wanted = MessageId.of(id)
-    recorded = [MessageId.of(other) for other in recording.messages]
-    same_port = sorted(other for other in recorded if other.topic == wanted.topic)
-    if not same_port:
-        ports = {f"{other.stage}.{other.port}" for other in recorded}
-        port = f"{wanted.stage}.{wanted.port}"
-        raise Refused(f"--until {id}: {recording.path} has no message of {port!r}{suggest(port, ports)}")
-    near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
-    raise Refused(
-        f"--until {id}: {recording.path} has no such message; the nearest: "
-        f"{', '.join(map(str, sorted(near)))} (of {same_port[0]} to #{same_port[-1].sequence})"
-    )
 
 
 def first_match(recording: Recording, graph: Graph, condition: str) -> str | None:
@@ -110,8 +94,7 @@ class Traveller:
         self._folder = folder
         self._causes = Causes(recording)
         self._log: list[str] = []
-        self._processes: dict[tuple[str, int, int], tuple[Stage, Iterator[Execution]]] = {}
-        """By stage, replica and incarnation."""
+        self._processes: dict[Process, tuple[Stage, Iterator[Execution]]] = {}
 
     def go(self, start: str, *, step: bool, prompt: bool) -> None:
         """Shows a message, with ``step`` the ones after it too for as long as somebody presses Enter."""
@@ -147,11 +130,11 @@ class Traveller:
         """The process that took a step, as far as it has been executed again."""
         node = self._graph.nodes[step.stage]
         stateful = node.type.cls.stateful
-        process = (step.stage, step.replica, 0 if stateful else step.incarnation)
+        process = step.process._replace(incarnation=0) if stateful else step.process
         if process not in self._processes:
             steps = steps_of(self._recording, Task(step.stage, step.incarnation), node)
             if step.stage in replicated(self._recording.graph):
-                own = (one for one in steps if (one.stage, one.replica, one.incarnation) == process)
+                own = (one for one in steps if one.process == process)
                 steps = sorted(own, key=lambda one: one.number)
             files = Path(tempfile.mkdtemp(dir=self._folder))
             again = Reexecution(self._recording, node, steps, seed=self._graph.seed, directory=files, log=self._hear)

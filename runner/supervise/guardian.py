@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from runner.contract import Level, Refused, Restarted
+from runner.contract import EXIT_REFUSED, Level, Refused, Restarted
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
@@ -14,7 +14,7 @@ from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
-from runner.process.stage_process import EXIT_REFUSED, RECORDED_SECONDS
+from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.child import Child, Progress
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Pulses
@@ -203,7 +203,7 @@ class Guardian:
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""
         if not present:
-            child = self._children.get((process.stage, process.replica))
+            child = self._children.get(process.place)
             if self._hosts is not None and child is not None and child.process == process:
                 child.unheard_since = time.monotonic()
         elif process in self._started and process not in self._ready:
@@ -225,7 +225,7 @@ class Guardian:
 
     def _absent(self) -> list[tuple[str, int]]:
         """(stage, replica) of which no process has ever been ready."""
-        ready = {(process.stage, process.replica) for process in list(self._ready)}  # which another thread may change
+        ready = {process.place for process in list(self._ready)}  # which another thread may change
         return [key for key in self._graph.processes() if key not in ready]
 
     def restart(self, name: str, ended: Callable[[], bool]) -> str:
@@ -312,7 +312,7 @@ class Guardian:
             self._say(f"{name} was {ASKED}", "info")
             self._give_up(child, ASKED)
             return None
-        absent = (process.stage, process.replica) in self._absent()
+        absent = process.place in self._absent()
         # What a stage remembers is rebuilt from recorded messages, if there are any.
         forgets = self._run.steps_only and self._run.remembers(process.stage)
         budget = 0 if forgets else self._graph.nodes[process.stage].restarts
@@ -338,9 +338,9 @@ class Guardian:
         process = child.process
         if process not in self.settled and time.monotonic() < child.dies_at + SETTLE_SECONDS:
             return
-        successor = self._start(Process(process.stage, process.replica, process.incarnation + 1))
+        successor = self._start(process._replace(incarnation=process.incarnation + 1))
         successor.restarted_because, successor.crashes = child.replaced_because, child.crashes
-        self._children[process.stage, process.replica] = successor
+        self._children[process.place] = successor
 
     def _show_output(self, child: Child) -> None:
         for line in last_lines(child.log, SHOWN_LINES, child.log_from):

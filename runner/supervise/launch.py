@@ -104,7 +104,7 @@ class Launcher:
         run, task = self._run, self._assignment(process, progress)
         log = run.log_of(process)
         log_from = log.stat().st_size if log.exists() else 0
-        host = run.graph.host_of(process.stage, process.replica)
+        host = run.graph.host_of(*process.place)
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
             handle = self._hosts.start(host, process, task, log)
         else:

@@ -211,13 +211,13 @@ class Supervisor:
 
     def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
         with self._numbering:
-            step = Step(SUPERVISOR, 0, 0, self._own_steps, "", (), emitted, time.time_ns(), 0, 0, 0, outcome)
+            step = Step(*self._own, self._own_steps, "", (), emitted, time.time_ns(), 0, 0, 0, outcome)
             self._own_steps += 1
             self._bus.publish(f"s/{SUPERVISOR}", codec.pack(step))
 
     def _declare_lost(self, process: Process, reason: str) -> None:
         """Tells everybody that a process is dead, and deals its parts to others."""
-        lost = Lost(process.stage, process.replica, process.incarnation, reason, time.time_ns())
+        lost = Lost(*process, reason, time.time_ns())
         self._bus.publish(f"x/{process.stage}", codec.pack(lost))
         self._delivery.lost(process)
 
@@ -283,8 +283,7 @@ class Supervisor:
 
     def _say(self, text: str, level: Level) -> None:
         self._terminal.show(SUPERVISOR, text, level)
-        line = LogLine(SUPERVISOR, 0, level, text, time.time_ns())
-        self._bus.publish(f"l/{SUPERVISOR}", codec.pack(line))
+        self._bus.log(text, level)
 
 
 def _own_routes(graph: Graph) -> Iterator[Route]:

@@ -22,8 +22,9 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
-from runner.contract import Refused
+from runner.contract import Level, Refused
 from runner.graph.placement import Network
+from runner.message.codec import LogLine, pack
 from runner.message.packet import Packet, Process
 from runner.transport.session import (
     CLOSE_SECONDS,
@@ -109,6 +110,13 @@ class Bus:
             )
         publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
         os.sched_yield()  # Zenoh's thread that sends was often woken on this one's core
+
+    def log(self, text: str, level: Level) -> LogLine:
+        """Sends a line of this process' log, which is shown and recorded, and returns it."""
+        assert self._process is not None
+        line = LogLine(*self._process.place, level, text, time.time_ns())
+        self.publish(f"l/{self._process.stage}", pack(line))
+        return line
 
     def subscribe(self, path: str, callback: Callable[[Packet], None]) -> None:
         """Calls back, in turn, for everything sent to ``path`` (``*`` and ``**`` allowed)."""

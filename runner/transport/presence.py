@@ -37,7 +37,7 @@ class Presence:
         """Blocks until all, (stage, replica), are present; False when ``until`` became true first."""
         wanted = set(expected)
         with self._changed:
-            while not wanted <= {(process.stage, process.replica) for process in self.living}:
+            while not wanted <= {process.place for process in self.living}:
                 if until():
                     return False
                 self._changed.wait(0.1)
@@ -54,5 +54,4 @@ class Presence:
 
 
 def _raise(incarnations: dict[tuple[str, int], int], process: Process) -> None:
-    place = process.stage, process.replica
-    incarnations[place] = max(process.incarnation, incarnations.get(place, 0))
+    incarnations[process.place] = max(process.incarnation, incarnations.get(process.place, 0))

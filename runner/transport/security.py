@@ -21,20 +21,10 @@ def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     Whoever shows no certificate of the graph's authority is not let in. Whoever is let in and is none of the graph's
     hosts gets and sends nothing. Only the head has processes started.
     """
-    # What a router sends on it has got from the head, or refused itself.
-    others = [name for name in network.hosts if name not in (network.head, ROUTER)]
-    rules = [
-        _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
-        _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
-    ]
-    subjects: dict[str, list[str]] = {"hosts": list(network.hosts), **({"others": others} if others else {})}
-    policies = {"hosts": "take part", **({"others": "give orders"} if others else {})}
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": tls(credentials),
-        **_access(
-            "deny", rules, [{"id": name, "cert_common_names": names} for name, names in subjects.items()], policies
-        ),
+        **_access("deny", *_hosts(network)),
     }
 
 
@@ -47,32 +37,40 @@ def readers_only(network: Network | None, public: str | None) -> dict[str, Any]:
         if public is None:
             return {}
         rule = _rule("say nothing", "deny", (*SPEAKING, "query"), ("ingress",), "**")
-        return _access("allow", [rule], [{"id": "strangers", "link_protocols": ["tcp"]}], {"strangers": "say nothing"})
-    settings = security(network, network.credentials)
-    access = settings["access_control"]
-    rules = [
-        *access["rules"],
+        return _access(
+            "allow", [rule], [{"id": "strangers", "link_protocols": ["tcp"]}], {"strangers": ["say nothing"]}
+        )
+    rules, subjects, policies = _hosts(network)
+    rules += [
         _rule("listen", "allow", ("declare_subscriber",), ("ingress", "egress"), "**"),
         _rule("be told", "allow", ("put", "delete"), ("egress",), "**"),
     ]
-    subjects = [
-        *access["subjects"],
+    subjects += [
         {"id": "tools", "link_protocols": ["unixsock-stream"]},
         {"id": "readers", "cert_common_names": [READER]},
     ]
-    policies = [
-        *access["policies"],
-        {"rules": ["take part"], "subjects": ["tools"]},
-        {"rules": ["listen", "be told"], "subjects": ["readers"]},
+    policies |= {"tools": ["take part"], "readers": ["listen", "be told"]}
+    protocols = ["tls", "unixsock-stream"]
+    return {"transport/link/protocols": protocols, **_access("deny", rules, subjects, policies)}
+
+
+def _hosts(network: Network) -> tuple[list[Any], list[Any], dict[str, list[str]]]:
+    """Rules, who there is, and which rules hold for whom: all hosts take part, and only the head gives orders."""
+    rules = [
+        _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
+        _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
     ]
-    return {
-        "transport/link/protocols": ["tls", "unixsock-stream"],
-        "access_control": {**access, "rules": rules, "subjects": subjects, "policies": policies},
-    }
+    subjects = [{"id": "hosts", "cert_common_names": list(network.hosts)}]
+    policies = {"hosts": ["take part"]}
+    # What a router sends on it has got from the head, or refused itself.
+    if others := [name for name in network.hosts if name not in (network.head, ROUTER)]:
+        subjects.append({"id": "others", "cert_common_names": others})
+        policies["others"] = ["give orders"]
+    return rules, subjects, policies
 
 
-def _access(default: str, rules: list[Any], subjects: list[Any], policies: dict[str, str]) -> dict[str, Any]:
-    listed = [{"rules": [rule], "subjects": [subject]} for subject, rule in policies.items()]
+def _access(default: str, rules: list[Any], subjects: list[Any], policies: dict[str, list[str]]) -> dict[str, Any]:
+    listed = [{"rules": names, "subjects": [subject]} for subject, names in policies.items()]
     access = {"rules": rules, "subjects": subjects, "policies": listed}
     return {"access_control": {"enabled": True, "default_permission": default, **access}}
 

@@ -44,14 +44,11 @@ class Canvas:
 
         What cannot be drawn is named on stderr and left out.
         """
-        fresh = True
-        for drawing in drawn(self._graph, self._views, sealed):
-            if fresh or isinstance(drawing, d.NextStep):
-                self._step += 1
-                self._stream.set_time(STEP, sequence=self._step)
-                self._stream.set_time(TIME, duration=np.timedelta64(sealed.time_ns, "ns"))
-                fresh = False
-            if not isinstance(drawing, d.NextStep):
+        for drawings in filter(None, drawn(self._graph, self._views, sealed)):
+            self._step += 1
+            self._stream.set_time(STEP, sequence=self._step)
+            self._stream.set_time(TIME, duration=np.timedelta64(sealed.time_ns, "ns"))
+            for drawing in drawings:
                 self._put(drawing)
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:

@@ -64,20 +64,9 @@ def _write_drawings(recording: Recording, graph: Graph, views: d.Views, sink: _S
     sink.put(scribe.written(list(views.static()), now), now)
     for id, message in recording.messages.items():
         now = max(now, message.log_time_ns)
-        for number, step in enumerate(_steps(drawn(graph, views, recording.envelope(id)))):
+        for number, step in enumerate(drawn(graph, views, recording.envelope(id))):
             now += STEP_NS if number else 0
             sink.put(scribe.written(step, now), now)
-
-
-def _steps(drawings: Iterable[d.Drawing]) -> Iterator[list[d.Drawing]]:
-    step: list[d.Drawing] = []
-    for drawing in drawings:
-        if isinstance(drawing, d.NextStep):
-            yield step
-            step = []
-        else:
-            step.append(drawing)
-    yield step
 
 
 class _Sink:
@@ -121,7 +110,7 @@ class _Scribe:
         for drawing in drawings:
             if isinstance(drawing, d.Clear):
                 yield from self._cleared(_clean(drawing), now)
-            elif not isinstance(drawing, d.NextStep):
+            else:
                 self._standing[_clean(drawing)] = drawing
                 yield self._one(drawing, now)
 

@@ -68,7 +68,10 @@ def _stream(path: Path) -> rr.RecordingStream:
 
 
 def _write(stream: rr.RecordingStream, target: Path) -> None:
-    stream.stdout() if target == Path("-") else stream.save(target)
+    try:
+        stream.stdout() if target == Path("-") else stream.save(target)
+    except RuntimeError as error:
+        raise Refused(f"{target}: cannot be written: {error}") from None
 
 
 # ------------------------------------------------------------------------------------ live
@@ -80,6 +83,7 @@ def view_live(path: Path | None = None, save: Path | None = None) -> None:
     ``path`` is its recording, by default the one in ``recordings`` being written.
     """
     path = path or newest_live(Path("recordings"))
+    open_file(path).close()  # or it is refused before a viewer opens
     # The graph comes first: drawing, and the viewer that this starts, take what it leaves of the cores.
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     if save is not None:
@@ -167,7 +171,10 @@ def screenshot(rrd: Path, png: Path) -> None:
     size = "x".join(map(str, WINDOW))
     command = [RERUN, "--bind", "127.0.0.1", "--port", str(_free_port())]
     command += ["--window-size", size, "--screenshot-to", str(png.absolute()), str(rrd.absolute())]
-    png.unlink(missing_ok=True)
+    try:
+        png.unlink(missing_ok=True)
+    except OSError as error:
+        raise Refused(f"{png}: cannot be written: {error.strerror}") from None
     with _virtual_display(size) as display, tempfile.TemporaryDirectory() as runtime:
         settings = {"WGPU_BACKEND": "vulkan", "XDG_RUNTIME_DIR": runtime}
         environment = {**os.environ, **settings, "DISPLAY": display}

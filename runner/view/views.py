@@ -9,7 +9,7 @@ from runner.contract import Refused
 from runner.graph.graph import Graph
 from runner.message.codec import Envelope, open_envelope
 from runner.recording.recording import kind_of
-from runner.view.drawing import Drawing, Views
+from runner.view.drawing import Drawing, NextStep, Views
 
 
 def require(module: str, what: str, extra: str) -> None:
@@ -23,16 +23,20 @@ def require_viewer() -> None:
     require("rerun", "the viewer is Rerun, which", "view")
 
 
-def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[Drawing]:
-    """What one message shows; what cannot be drawn is named on stderr and left out."""
-    found: list[Drawing] = []
+def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[list[Drawing]]:
+    """What one message shows, step by step; what cannot be drawn is named on stderr and left out."""
+    steps: list[list[Drawing]] = [[]]
     try:
         if (kind := kind_of(graph, sealed.id)) is not None:
-            found.extend(views.draw(open_envelope(kind, sealed)))
+            for drawing in views.draw(open_envelope(kind, sealed)):
+                if isinstance(drawing, NextStep):
+                    steps.append([])
+                else:
+                    steps[-1].append(drawing)
     except Exception as error:  # the rest of the recording is still worth seeing
         reason = str(error).partition("\n")[0]
         print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
-    return found
+    return steps
 
 
 def load_views(graph: Graph) -> Views:

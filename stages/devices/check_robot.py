@@ -49,6 +49,9 @@ def report(robot: Robot) -> Iterator[str]:
     yield f"touching {', '.join(often) or 'no two links'} in more than {_OFTEN:.0%} of random postures"
     yield f"reach    {len(reached)} of {len(places)} places of the workspace, from the top"
     yield f"camera   {'sees all' if inside else 'does not see all'} of the workspace"
+    for number, q in enumerate(robot.views, 1):
+        close = world.contacts(q)
+        yield f"view {number}   {'free' if not close else f'too close: {sorted(close)}'}"
 
 
 def picture(robot: Robot) -> Rgb:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
+from stages.devices.efforts import FILTER, Efforts, levers
 from stages.geometry.arrays import Floats
 from stages.messages import RobotCommand
 from stages.messages.robot import Guard, Stopped
@@ -23,10 +24,6 @@ _GRIPPER_RAMP = 0.6
 """Seconds over which a new gripper opening is commanded."""
 _GRIPPER_HOLD = 0.3
 """Seconds for the fingers to stall or arrive."""
-_FILTER = 0.03
-"""Seconds over which efforts are smoothed: servos answer a jump of the acceleration with a delay."""
-_SHORTEST_LEVER = 0.2
-"""Metres: of joints whose axis passes closer to the hand hardly any force is felt, only friction."""
 
 
 class Servo:
@@ -48,10 +45,7 @@ class Servo:
         """By the joint that each moves."""
         self.fingers = np.array([k for k in range(model.nu) if moved.get(k) not in robot.posture])
         self._hand = model.body(robot.gripper.link).id
-        alone = robot.specification(seen=False)
-        alone.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        self._bare = alone.compile()
-        self._bare_data = mujoco.MjData(self._bare)
+        self._efforts = Efforts(robot, tuple(robot.posture), balanced=True)
         self._asked = False
         self.error = 0.0
         """Largest joint error of the newest command, radians."""
@@ -104,8 +98,10 @@ class Servo:
             self.error = max(self.error, float(np.abs(self._data.qpos[addresses] - target).max()))
             # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
             outside = self._data.actuator_force[actuators] - still - effort
-            felt += (outside - felt) * self._timestep / _FILTER
-            self.force = max(self.force, float((np.abs(felt) / self._levers(dofs))[arm].max()))
+            felt += (outside - felt) * self._timestep / FILTER
+            self.force = max(
+                self.force, float((np.abs(felt) / levers(self._model, self._data, self._hand, dofs))[arm].max())
+            )
             if self._is_wrong(command.guard):
                 return
             if k % round(PIECE / self._timestep) == 0:
@@ -156,12 +152,6 @@ class Servo:
             self._data.ctrl[moving] = position + lag * slower
             self._step()
 
-    def _levers(self, dofs: Any) -> Floats:
-        """Metres between the hand and each joint's axis."""
-        linear = np.zeros((3, self._model.nv))
-        mujoco.mj_jacBody(self._model, self._data, linear, None, self._hand)
-        return np.maximum(np.linalg.norm(linear[:, dofs], axis=0), _SHORTEST_LEVER)
-
     def _resample(self, command: RobotCommand) -> tuple[Floats, Floats, Floats]:
         """The trajectory at every time step of the simulation, and the efforts that it takes."""
         times = command.times
@@ -169,19 +159,16 @@ class Servo:
             return command.positions, command.velocities, np.zeros_like(command.positions)
         spline = CubicHermiteSpline(times, command.positions, command.velocities)
         steps = np.minimum(np.arange(1, round(times[-1] / self._timestep) + 1) * self._timestep, times[-1])
-        efforts = self._efforts(command, np.gradient(command.velocities, times, axis=0))
+        efforts = self._taken(command, np.gradient(command.velocities, times, axis=0))
         return spline(steps), spline(steps, 1), np.stack([np.interp(steps, times, one) for one in efforts.T], axis=1)
 
-    def _efforts(self, command: RobotCommand, accelerations: Floats) -> Floats:
-        """T x J, newton metres (newtons) that a trajectory takes with nothing in the hand: inverse dynamics."""
-        model, data = self._bare, self._bare_data
-        joints = [model.joint(name) for name in command.joint_names]
-        addresses, dofs = (np.array([getattr(joint, key)[0] for joint in joints]) for key in ("qposadr", "dofadr"))
-        for name, position in self._robot.posture.items():
-            data.joint(name).qpos[0] = position
+    def _taken(self, command: RobotCommand, accelerations: Floats) -> Floats:
+        """T x J, newton metres (newtons) that a trajectory takes; joints that are not named stand as at home."""
+        home = self._robot.posture
+        named = [list(home).index(name) for name in command.joint_names]
+        q, v, a = np.array(list(home.values())), *np.zeros((2, len(home)))
         result = np.zeros_like(command.positions)
-        for k, (q, v, a) in enumerate(zip(command.positions, command.velocities, accelerations, strict=True)):
-            data.qpos[addresses], data.qvel[dofs], data.qacc[dofs] = q, v, a
-            mujoco.mj_inverse(model, data)
-            result[k] = data.qfrc_inverse[dofs]
+        for k, now in enumerate(zip(command.positions, command.velocities, accelerations, strict=True)):
+            q[named], v[named], a[named] = now
+            result[k] = self._efforts.taken(q, v, a)[named]
         return result

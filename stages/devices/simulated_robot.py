@@ -23,15 +23,19 @@ _LOOK = 4.0
 
 
 class SimulatedRobot(Stage):
-    """What every simulated world does, whatever is in it; its joints and its camera are those of a robot that nobody
-    calibrated today."""
+    """What every simulated world does, whatever is in it; its joints and, unless it is ``calibrated``, its camera are
+    those of a robot that nobody calibrated today."""
 
     device = True
 
-    def __init__(self, robot: Robot, suite: Suite, catalogue: Catalogue, seed: int) -> None:
+    def __init__(
+        self, robot: Robot, suite: Suite, catalogue: Catalogue, seed: int, *, calibrated: bool = False
+    ) -> None:
         self._robot, self._suite, self._seed = robot, suite, seed
         self._looks = 0
-        self._wrong = Miscalibration.draw(np.random.default_rng([seed, 4]), robot, joints=suite.joints)
+        self._wrong = Miscalibration.draw(
+            np.random.default_rng([seed, 4]), robot, joints=suite.joints, calibrated=calibrated
+        )
         self._simulation = Simulation(catalogue, robot, suite.names, suite.table, factors=suite.factors)
         self._started = False
         """Somebody may meddle: the start scene is laid out."""

@@ -1,7 +1,8 @@
-"""Arrays of numbers, and which of their rows are equal."""
+"""Arrays of numbers: which rows are equal, which measurements say most."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,3 +23,16 @@ def distinct_rows(rows: NDArray[Any]) -> tuple[Indices, Indices]:
     which = np.empty(len(rows), np.intp)
     which[order] = np.cumsum(new) - 1
     return order[new], which
+
+
+def most_telling(informations: Sequence[Floats], known: Floats) -> Iterator[int]:
+    """Indices of measurements, each the one that leaves least uncertainty after those before it (D-optimal, greedy).
+
+    ``informations`` are K x K each, ``known`` is what is known before any of them.
+    """
+    left = list(range(len(informations)))
+    while left:
+        best = max(left, key=lambda k: np.linalg.slogdet(known + informations[k])[1])
+        known = known + informations[best]
+        left.remove(best)
+        yield best

@@ -60,8 +60,14 @@ def random_rotations(count: int, rng: np.random.Generator) -> Floats:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
+def random_direction(rng: np.random.Generator) -> Floats:
+    """A unit vector uniform over the sphere, 3."""
+    direction = rng.normal(size=3)
+    return direction / np.linalg.norm(direction)
+
+
 def compose(A: Floats, B: Floats) -> Floats:
-    """Products of stacked 3 x 3 matrices without BLAS, whose rounding may depend on its number of threads."""
+    """Products of stacked square matrices without BLAS, whose rounding may depend on its number of threads."""
     return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 
 
@@ -76,6 +82,11 @@ def pose(R: Floats, t: Floats) -> Floats:
     T[:3, :3] = R
     T[:3, 3] = t
     return T
+
+
+def small_motion(change: Floats) -> Floats:
+    """A small motion (4 x 4) of a rotation vector and a translation, 6."""
+    return pose(exp_so3(change[:3]), change[3:])
 
 
 def is_rotation(R: Floats) -> bool:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from stages.geometry.arrays import Floats
+from stages.geometry.arrays import Floats, most_telling
 from stages.geometry.camera import project
-from stages.geometry.poses import exp_so3, inverse, pose
+from stages.geometry.poses import exp_so3, inverse, pose, small_motion
 from stages.hand_eye.rig import Rig
 from stages.hand_eye.solving import Sight
 from stages.planning.collision import CollisionWorld, add_table
@@ -88,7 +89,7 @@ def proposed(
         informations.append(_information(rig, q))
         if len(found) == _ENOUGH * count:
             break
-    return [found[k] for k in _choice(informations, count)]
+    return [found[k] for k in islice(most_telling(informations, np.eye(12)), count)]
 
 
 def nearest_first(postures: list[Floats], start: Floats) -> list[Floats]:
@@ -195,22 +196,9 @@ def _information(rig: Rig, q: Floats) -> Floats:
     here = sight.errors(rig.X, rig.Y)
     columns: list[Floats] = []
     for k in range(12):
-        step = _STEP * np.eye(12)[k]
-        X, Y = (T @ pose(exp_so3(one[:3]), one[3:]) for T, one in ((rig.X, step[:6]), (rig.Y, step[6:])))
-        columns.append((sight.errors(X, Y) - here).ravel() / _STEP)
+        change = _STEP * np.eye(12)[k]
+        columns.append(
+            (sight.errors(rig.X @ small_motion(change[:6]), rig.Y @ small_motion(change[6:])) - here).ravel() / _STEP
+        )
     J = np.stack(columns, axis=1)
     return J.T @ J
-
-
-def _choice(informations: list[Floats], count: int) -> list[int]:
-    """Greedy."""
-    chosen: list[int] = []
-    total = np.eye(12)
-    while len(chosen) < min(count, len(informations)):
-        gains = [
-            -np.inf if k in chosen else float(np.linalg.slogdet(total + one)[1]) for k, one in enumerate(informations)
-        ]
-        best = int(np.argmax(gains))
-        chosen.append(best)
-        total = total + informations[best]
-    return chosen

@@ -35,16 +35,10 @@ class Rig:
     robot: Robot
     board: Board
 
-    @cached_property
+    @property
     def held(self) -> bool:
         """Whether the hand holds the board."""
-        robot, camera = self.robot, self.robot.camera.link
-        if not camera:
-            return True
-        postures = (robot.posture, {name: position + 0.1 for name, position in robot.posture.items()})
-        links = [robot.body.link_poses(tuple(q), np.array(list(q.values()))) for q in postures]
-        first, second = (inverse(at[robot.gripper.link]) @ at[camera] for at in links)
-        return not np.allclose(first, second, atol=1e-9)
+        return not self.robot.camera_in_hand
 
     @property
     def link(self) -> str:

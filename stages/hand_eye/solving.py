@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from stages.geometry.arrays import Floats
 from stages.geometry.camera import project
-from stages.geometry.poses import exp_so3, inverse, log_so3, pose, rotation_angle
+from stages.geometry.poses import exp_so3, inverse, log_so3, pose, rotation_angle, small_motion
 
 _SURE = 1.0
 """Pixels beyond which a corner counts less and less: it is not where it was found."""
@@ -101,11 +101,11 @@ def refined(sights: Sequence[Sight], X: Floats, Y: Floats) -> Fit:
     """The fit that is least squares from here on: every corner of every picture counts, outliers less."""
 
     def errors(steps: Floats) -> Floats:
-        moved = X @ _step(steps[:6]), Y @ _step(steps[6:])
+        moved = X @ small_motion(steps[:6]), Y @ small_motion(steps[6:])
         return np.concatenate([sight.errors(*moved).ravel() for sight in sights])
 
     found: Any = least_squares(errors, np.zeros(12), loss="soft_l1", f_scale=_SURE)
-    best = X @ _step(found.x[:6]), Y @ _step(found.x[6:])
+    best = X @ small_motion(found.x[:6]), Y @ small_motion(found.x[6:])
     residuals = np.array([np.sqrt((sight.errors(*best) ** 2).sum(1).mean()) for sight in sights])
     variance = max(2 * found.cost / max(found.fun.size - 12, 1), _NOISE**2)
     return Fit(*best, residuals, variance * np.linalg.pinv(found.jac.T @ found.jac)[:6, :6])
@@ -138,8 +138,3 @@ def turns(sights: Sequence[Sight]) -> tuple[Floats, Floats]:
 def _nearest_rotation(M: Floats) -> Floats:
     U, _, V = np.linalg.svd(M)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-
-
-def _step(step: Floats) -> Floats:
-    """A small motion, 6: a rotation vector and a translation."""
-    return pose(exp_so3(step[:3]), step[3:])

@@ -6,6 +6,8 @@ from stages.messages.robot import Stopped
 
 OWN_ARM = "own arm"
 """Purposes of looks that are for this begin so; nothing is perceived in them."""
+CAMERAS_WAY = f"{OWN_ARM}: what is in the way of the camera"
+"""Purpose of a look before the arm brings the camera elsewhere."""
 
 
 class PostureRequest(Message, frozen=True, kw_only=True):

@@ -11,6 +11,8 @@ class Candidate(Struct, frozen=True, kw_only=True):
     box: Box
     label: str
     confidence: float
+    others: tuple[str, ...] = ()
+    """Labels that it may have instead, the likeliest first, where the detector is in doubt."""
 
 
 class Candidates(Message, frozen=True, kw_only=True):
@@ -106,6 +108,8 @@ class Offer(Struct, frozen=True, kw_only=True):
     candidate: Candidate
     share: float
     """Of what it claims that its object must explain."""
+    instead: bool = False
+    """Whether this is another offer's candidate by a less likely label."""
 
 
 class Contender(Part, frozen=True, kw_only=True):

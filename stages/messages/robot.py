@@ -74,3 +74,5 @@ class RobotState(Message, frozen=True, kw_only=True):
     """What was measured where it stopped."""
     force: float = 0.0
     """Largest force from outside that was felt while the last command ran, as if it acted on the hand, newtons."""
+    shown: bool = False
+    """Nothing moves: commands are only shown, and ``reason`` says why."""

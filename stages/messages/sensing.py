@@ -12,6 +12,8 @@ class LookRequest(Message, frozen=True, kw_only=True):
     starts_lineage: ClassVar[bool] = True
     purpose: str
     """Shown to people, for example ``goal``, ``start`` or ``after transfer 2``."""
+    view: int = 0
+    """Where the camera is wanted: 0 while the arm is at home, else the number of a view of the robot's description."""
 
 
 class SensorErrors(Struct, frozen=True, kw_only=True):

@@ -85,6 +85,8 @@ class TransferRequest(Message, frozen=True, kw_only=True):
     transfer: Transfer
     scene: SceneGraph
     number: int
+    then: tuple[Transfer, ...] = ()
+    """What the plan has after it, for an arm that only shows what it would do."""
 
 
 class Recover(Message, frozen=True, kw_only=True):

@@ -58,7 +58,7 @@ TOLERANCES = {
     "ObjectPose.cost": COST,
     "ObjectPose.box": PIXELS,
     "ObjectPose.visible": SHARE,
-    "ObjectPose.probability": PROBABILITY,
+    "ObjectPose.probability": Tolerance(0.05),
     "ObjectPose.spread_metres": POSE,
     "ObjectPose.spread_radians": Tolerance(0.01),
     "ObjectPose.looked_through": SHARE,

@@ -14,6 +14,11 @@ from stages.planning.search import Step
 from stages.robots import Robot, Table
 from stages.scene.stance import Standing
 
+_EXAMINED = 36
+"""Places of one step that are examined before anything moves."""
+_QUARTER = 0.1
+"""Metres apart at which two places differ as much as by a quarter turn."""
+
 
 class Handling:
     """Grasps, postures and straight motions of single steps, with the least margins that a transfer is done with."""
@@ -30,24 +35,38 @@ class Handling:
         world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=MARGINS[-1].clearance)
         targets = np.stack([scene.T_base_table @ place.T_table_object for place in places])
         errand = Errand(*objects[step.item], targets, step.source, step.destination)
-        return Handled(PickPlacePlanner(world, errand, self._rng, room=MARGINS[-1].room), self._robot)
+        return Handled(PickPlacePlanner(world, errand, self._rng, room=MARGINS[-1].room), self._robot, places)
 
 
 class Handled:
-    """The places of one step that can be reached, found as they are asked for and kept."""
+    """Which places of one step can be reached, found as it is asked for and kept."""
 
-    def __init__(self, planner: PickPlacePlanner, robot: Robot) -> None:
-        self._planner, self._robot = planner, robot
-        self._pending = planner.reachable(robot.home)
-        self._found: list[int] = []
+    def __init__(self, planner: PickPlacePlanner, robot: Robot, places: Sequence[Standing]) -> None:
+        self._planner, self._robot, self._places = planner, robot, places[:_EXAMINED]
+        self._reached: dict[int, bool] = {}
 
     def places(self) -> Iterator[int]:
-        """By number, best first."""
-        yield from self._found
-        for number in self._pending:
-            self._found.append(number)
-            yield number
+        """By number: the best, then always the one that differs most from all before, for those led nowhere."""
+        pending, found = list(range(len(self._places))), list[Standing]()
+        while pending:
+            number = max(pending, key=lambda k: min((_difference(self._places[k], one) for one in found), default=0.0))
+            pending.remove(number)
+            if self._reaches(number):
+                found.append(self._places[number])
+                yield number
+
+    def _reaches(self, number: int) -> bool:
+        if number not in self._reached:
+            self._reached[number] = self._planner.reaches(number, self._robot.home)
+        return self._reached[number]
 
     def why_not(self) -> tuple[str, tuple[str, ...]]:
         """Why no place is reached: in words, and the objects in the way."""
         return self._planner.obstacle[1], self._planner.in_the_way(self._robot.home)
+
+
+def _difference(a: Standing, b: Standing) -> float:
+    """Between two places of an object: metres, and what its turn is worth."""
+    A, B = a.T_table_object, b.T_table_object
+    turn = np.arccos(np.clip((np.trace(A[:3, :3].T @ B[:3, :3]) - 1) / 2, -1.0, 1.0))
+    return float(np.linalg.norm(A[:3, 3] - B[:3, 3]) + _QUARTER * turn / (np.pi / 2))

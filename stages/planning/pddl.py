@@ -15,7 +15,7 @@ from stages.planning.problem import TABLE, Problem
 DOMAIN = """\
 ; Picking and placing on a table. Items rest on convex items and on the table, and in concave items.
 (define (domain scene)
-  (:requirements :adl)
+  (:requirements :adl :typing)
   (:types
     thing label - object        ; a label names a pose in the robot's base frame
     support region - thing      ; the table, items, and regions attached to items

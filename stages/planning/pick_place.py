@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain, islice, product
 
 import numpy as np
@@ -33,8 +32,8 @@ _KEPT = 3
 """Feasible picks and places per grasp that are paired, and postures at which is looked for what is in the way."""
 _TRIED = 64
 """Hand poses per grasp that are tried for the place."""
-_EXAMINED, _TURNS = 36, 8
-"""Targets that are examined before anything moves, and hand poses per grasp at each."""
+_TURNS = 8
+"""Hand poses per grasp that are examined at each target before anything moves."""
 _SUSPECTED = 12
 """Hand poses at which is looked for what is in the way."""
 
@@ -108,46 +107,48 @@ class PickPlacePlanner:
         """``room``: see :class:`Margins`."""
         self._world, self._errand, self._rng, self._room = world, errand, rng, room
         self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
-        self._is_picked = False
+        self._grasps = distinct_grasps(errand.entry)
+        self._first_picks: dict[str, Pick | None] = {}
 
     def plans(self, start: Floats) -> Iterator[PickPlace]:
         """Complete plans from joint positions ``start`` (J), most preferred grasp first."""
-        for grasp in distinct_grasps(self._errand.entry):
+        for grasp in self._grasps:
             picks = list(islice(self._picks(grasp, start), _KEPT))
             places = list(islice(self._places(grasp, picks[0].lift[-1]), _KEPT)) if picks else []
             yield from self._connected(product(picks, places), start)
 
     def can_pick(self, start: Floats) -> bool:
         """Whether any grasp takes the object where it is and lifts it; the arm begins at joint positions ``start``."""
-        return any(next(self._picks(grasp, start), None) for grasp in distinct_grasps(self._errand.entry))
+        return any(next(self._picks(grasp, start), None) for grasp in self._grasps)
 
-    def reachable(self, start: Floats) -> Iterator[int]:
-        """Targets by number, best first, to which a grasp leads from where the object is.
+    def reaches(self, number: int, start: Floats) -> bool:
+        """Whether a grasp leads from where the object is to a target.
 
         Motions from ``start`` to the pick and from there to the place are not looked for: the cheap part of
         :meth:`plans`, which all but decides.
         """
-        pick = cache(lambda k: next(self._picks(grasps[k], start), None))
-        grasps = distinct_grasps(self._errand.entry)
-        for number, target in enumerate(self._errand.targets[:_EXAMINED]):
-            picks = (found for k in range(len(grasps)) if (found := pick(k)) is not None)
-            hands = ((hand, found) for found in picks for hand in self._hands(found.hand.grasp, target)[:_TURNS])
-            if any(self._place(hand, found.lift[-1]) is not None for hand, found in hands):
-                yield number
-            self._is_picked = any(pick(k) is not None for k in range(len(grasps)))
-            if not self._is_picked:
-                return
+        for grasp in self._grasps:
+            if grasp.name not in self._first_picks:
+                self._first_picks[grasp.name] = next(self._picks(grasp, start), None)
+            pick = self._first_picks[grasp.name]
+            hands = self._hands(grasp, self._errand.targets[number])[:_TURNS] if pick else []
+            if pick and any(self._place(hand, pick.lift[-1]) is not None for hand in hands):
+                return True
+        return False
 
     def in_the_way(self, start: Floats) -> tuple[str, ...]:
         """The fewest objects that keep the hand from the pick, or from the place if there is a pick.
 
-        Empty where it is not objects that keep it from there. To be asked once :meth:`reachable` has ended.
+        Empty where it is not objects that keep it from there. To be asked once :meth:`reaches` has said no.
         """
         poses = self._errand.targets if self._is_picked else [self._errand.T_base_object]
-        grasps = distinct_grasps(self._errand.entry)
-        hands = (hand for T in poses for grasp in grasps for hand in self._hands(grasp, T))
+        hands = (hand for T in poses for grasp in self._grasps for hand in self._hands(grasp, T))
         found = (self._touched(hand, start) for hand in islice(hands, _SUSPECTED))
         return min((names for names in found if names), key=self._effort, default=())
+
+    @property
+    def _is_picked(self) -> bool:
+        return any(self._first_picks.values())
 
     def _effort(self, names: Sequence[str]) -> tuple[int, int]:
         """How hard it is to clear a place: objects that nobody can move, then objects."""

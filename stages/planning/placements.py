@@ -16,7 +16,7 @@ from stages.planning.problem import TABLE, carriers
 from stages.planning.search import Step
 from stages.scene.catalogue import CatalogueObject
 from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed
-from stages.scene.virtual import region_poses
+from stages.scene.virtual import in_region, region_poses
 
 QUARTERS = 4
 RING = 24
@@ -89,8 +89,10 @@ class Placement:
 class Placements:
     """Placements of one step, best first."""
 
-    def __init__(self, goal: SceneGraph, stances: Mapping[str, Stances]) -> None:
+    def __init__(self, goal: SceneGraph, stances: Mapping[str, Stances], taught: SceneGraph) -> None:
+        """``goal`` may tell regions the other way round than they were ``taught``."""
         self._goal = Scene.of(goal, stances)
+        self._taught = {(item.parent, item.child): item for item in taught.virtual_objects}
         self._labels = {item.name: item.label for item in goal.objects}
         self._poses = {item.name: item.T_base_object for item in goal.objects}
         self._virtual = {item.name: item for item in goal.virtual_objects}
@@ -109,9 +111,19 @@ class Placements:
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
             for turned, cost in _orientations(T, item):
                 base = Standing.at(step.item, stances, turned)
-                near = shifts if k == 0 and cost < TURNED else shifts[:13]
-                made += [Placement(_shifted(base, shift), away + cost + float(np.hypot(*shift))) for shift in near]
+                for shift in shifts if k == 0 and cost < TURNED else shifts[:13]:
+                    standing = _shifted(base, shift)
+                    if self._as_taught(step, standing, scene):
+                        made.append(Placement(standing, away + cost + float(np.hypot(*shift))))
         return sorted(made, key=lambda placement: placement.cost)
+
+    def _as_taught(self, step: Step, item: Standing, scene: Scene) -> bool:
+        """Whether what the goal has beside this object is so, where that is told the other way round."""
+        if not step.region or (step.parent, step.item) in self._taught:
+            return True
+        taught = self._taught[step.item, step.parent]
+        child = scene.standing[step.parent].T_table_object
+        return in_region(taught, item.T_table_object, child, item.stance.item.symmetries)
 
     def reserved(self, pending: Sequence[Step], scene: Scene) -> list[list[Standing]]:
         """Where the object of each step still to come may stand on the table, as demonstrated first."""

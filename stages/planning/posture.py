@@ -95,7 +95,7 @@ class PostureRoutine:
         if path is not None:
             label = self._request.label
             state = yield robot_command(self._robot, label, path, guard=Guard(force=_BUMP))
-            reason = f"{state.reason} on the way to {label}" if state.stopped else ""
+            reason = f"{state.reason} on the way to {label}" if state.stopped or state.shown else ""
         if reason:
             self._log(f"{self._request.label}: {reason}")
         return Arrived(
@@ -114,7 +114,7 @@ class PostureRoutine:
         path = free_motion(self._world, arm(self._robot, state), self._robot.home, self._rng)
         if path is not None:
             state = yield robot_command(self._robot, "go home", path, guard=Guard(force=_BUMP))
-        arrived = path is not None and not state.stopped
+        arrived = path is not None and not state.stopped and not state.shown
         return Outcome(
             number=0,
             object="",

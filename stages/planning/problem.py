@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from stages.messages.scene import SceneGraph
@@ -77,6 +77,12 @@ class Problem:
     def finally_at(self, item: str) -> str:
         """The region in which the item belongs, or the support that it belongs on where it has none."""
         return self.regions[item].name if item in self.regions else self.goal.get(item, TABLE)
+
+    def beside(self, item: str) -> Iterator[str]:
+        """What the item belongs beside, what that one belongs beside, and so on."""
+        while item in self.regions:
+            item = self.regions[item].parent
+            yield item
 
     def satisfied(self) -> bool:
         """Whether the goal holds already."""

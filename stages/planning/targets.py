@@ -31,6 +31,8 @@ MIDDLE = 0.01
 HIDDEN = 0.1
 """Cost of a place that other objects hide wholly from the camera, in metres of shift: nobody has seen it free, and
 nobody will see what stands there."""
+SIGHT = 0.04
+"""Metres within which one look at how hidden a place is does for all places."""
 CROWDED = 0.08
 """Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
 FAR = 0.1
@@ -45,7 +47,11 @@ BRANCHES, TRIES = 4, 40
 BEYOND = 1.0
 """Cost of a place outside the area in which the robot places: the hand may get there, as it does not everywhere."""
 ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
-"""Shift in metres, and trace of the rotation between them, within which two poses are as good as one."""
+"""Shift in metres, and trace of the rotation between them, within which two poses are as good as one: the arm reaches
+both or none."""
+SPREAD = 0.5
+"""The same for what may be anywhere on the table, as a share of how far it is from where it was shown: so that a few
+places reach far."""
 
 ANYWHERE = (-10.0, 10.0)
 """Metres: no limit beside the robot's own."""
@@ -132,7 +138,7 @@ class Targets:
     """Chooses poses for the steps of a plan, each in the scene that the steps before it leave behind.
 
     Depth first: a place counts only if the hand can take the object there, and where a later step finds no place
-    because of an object that was placed before, that object's next place is tried.
+    because of an object that was placed before, that object's place is tried that differs most from those before.
     """
 
     def __init__(
@@ -170,10 +176,7 @@ class Targets:
             failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
                 break
-        if failed is None:
-            why, obstacles = options.handled.why_not()
-            return Blocked(step, obstacles or options.obstacles, why)
-        return failed
+        return _trouble(step, options, failed)
 
     def _options(self, step: Step, rest: Sequence[Step], scene: Scene, again: bool) -> Options | Blocked:
         """What the same step in the same scene had before, or what is found now."""
@@ -184,7 +187,7 @@ class Targets:
         if key not in self._known:
             found, obstacles = self._goal_poses(step, scene) if final else self._free_spots(step, rest, scene)
             places = [placement.standing for placement in sorted(found, key=lambda placement: placement.cost)]
-            places = places[self._workspace.targets :] or places if again else places
+            places = (places[self._workspace.targets :] or places[len(places) // 2 :]) if again else places
             handled = self._handling.of(step, scene, places) if places else None
             self._known[key] = Options(places, handled, obstacles) if handled else Blocked(step, obstacles)
         return self._known[key]
@@ -213,7 +216,7 @@ class Targets:
         hidden: dict[tuple[float, ...], float] = {}
         sorted_again: list[Placement] = []
         for one in placements:
-            place = tuple(np.round(one.standing.T_table_stance[:2, 3] / ALIKE[0]))
+            place = tuple(np.round(one.standing.T_table_stance[:2, 3] / SIGHT))
             if place not in hidden:
                 hidden[place] = _hidden(one.standing, others, scene)
             sorted_again.append(Placement(one.standing, one.cost + hidden[place]))
@@ -225,10 +228,16 @@ class Targets:
         valid: list[Placement] = []
         beyond: list[Placement] = []
         blocking: list[tuple[str, ...]] = []
-        supported = (p for p in placements if self._supported(p.standing, step.destination, scene, margin))
-        for placement in islice(supported, self._workspace.considered):
-            if any(_alike(placement.standing, other.standing) for other in (*valid, *beyond)):
+        anywhere, considered = step.destination == TABLE and not step.region, 0
+        for placement in placements:
+            apart = max(ALIKE[0], SPREAD * placement.cost) if anywhere else ALIKE[0]
+            if any(_alike(placement.standing, other.standing, apart) for other in (*valid, *beyond)):
                 continue
+            if not self._supported(placement.standing, step.destination, scene, margin):
+                continue
+            considered += 1
+            if considered > self._workspace.considered:
+                break
             item = scene.rested(placement.standing, step.destination)
             hit = tuple(other.name for other in others if _is_near(item, other, self._workspace.clearance))
             if hit:
@@ -302,6 +311,19 @@ class Targets:
         return spots
 
 
+def _trouble(step: Step, options: Options, failed: Blocked | Crowded | None) -> Blocked | Crowded:
+    """Why a step leads nowhere: none of its places is reached, or what the last one led to ``failed``.
+
+    Where that is without any room, the step itself is blocked by what takes up other places of it.
+    """
+    if failed is None:
+        why, obstacles = options.handled.why_not()
+        return Blocked(step, obstacles or options.obstacles, why)
+    if isinstance(failed, Blocked) and not failed.obstacles and step.item in failed.involved and options.obstacles:
+        return Blocked(step, options.obstacles)
+    return failed
+
+
 def _fits(item: Standing, carrier: Standing) -> bool:
     """Whether the object finds room on the floor of a hollow, so that it need not lean on its wall."""
     if carrier.stance.cavity is None:
@@ -317,9 +339,9 @@ def neighbours(name: str, scene: Scene) -> list[str]:
     return sorted((other for other in gaps if gaps[other] < CROWDED), key=lambda other: gaps[other])
 
 
-def _alike(a: Standing, b: Standing) -> bool:
-    """Whether two poses of an object differ so little that the arm reaches both or none."""
-    if _distance(a, b) >= ALIKE[0]:
+def _alike(a: Standing, b: Standing, metres: float) -> bool:
+    """Whether two poses of an object differ so little that one of them is enough."""
+    if _distance(a, b) >= metres:
         return False
     return bool(a.T_table_object[:3, :3].ravel() @ b.T_table_object[:3, :3].ravel() > ALIKE[1])
 

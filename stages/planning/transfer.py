@@ -16,7 +16,7 @@ from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
-from stages.planning.motion import FAST, arm, free_motion, robot_command, straight_motion
+from stages.planning.motion import FAST, arm, densify, free_motion, robot_command, straight_motion
 from stages.planning.pick_place import (
     HOVER,
     LIFT,
@@ -27,6 +27,7 @@ from stages.planning.pick_place import (
     PickPlacePlanner,
     Place,
 )
+from stages.planning.rehearsal import Rehearsal
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 
@@ -59,7 +60,9 @@ _G = 9.81
 _WAYS_BACK = 3
 """Times that the way back is tried."""
 _AWAY = 0.05
-"""Radians from home beyond which the arm first goes home."""
+"""Radians from home beyond which the arm first goes home, and from a straight way within which it returns along it."""
+_RETRACED = 0.05
+"""Radians between the waypoints of the way back that the hand came."""
 
 
 @dataclass
@@ -85,9 +88,10 @@ class _UnderWay:
 class _BrokenOff(Exception):
     """A command was not carried out to its end."""
 
-    def __init__(self, state: RobotState, label: str) -> None:
+    def __init__(self, state: RobotState, label: str, waypoints: Floats | None) -> None:
         super().__init__(f"{state.reason} on the way to {label}")
-        self.state = state
+        self.state, self.waypoints = state, waypoints
+        """Of a free motion, whose beginning is free; None of one next to objects."""
 
 
 class TransferRoutine:
@@ -127,9 +131,13 @@ class TransferRoutine:
             self._tally.started = self._tally.clock
             failure = yield from self._go_home_first(state)
             if not failure[0]:
-                failure = yield from self._try_plans()
+                failure = yield from (self._rehearse(state.reason) if state.shown else self._try_plans())
         except _BrokenOff as broken:
+            let_go = self._tally.T_base_object is not None
             failure = yield from self._come_back(broken)
+            if not failure[0]:
+                # Whether what was let go of before stands where it should is for the next look to say.
+                failure = "unknown" if let_go else broken.state.stopped, str(broken)
         ending = f"{failure[0]}: {failure[1]}" if failure[0] else "let go of, and felt to stand"
         self._log(f"{transfer.object}: {ending}")
         return self._outcome(*failure)
@@ -141,24 +149,30 @@ class TransferRoutine:
             self._tally.started = self._tally.clock
             failure = yield from self._way_back(state)
         except _BrokenOff as broken:
-            failure = self._stands(broken)
+            failure = yield from self._come_back(broken)
         return replace(self._outcome(*failure), number=0)
 
     def _come_back(self, broken: _BrokenOff) -> Steps:
         """After a slip or a touch; where somebody asks to stop, the robot fails or the way back is barred, the arm
         stays."""
         newest = broken
-        for _ in range(_WAYS_BACK):
+        for tries in range(_WAYS_BACK):
             if newest.state.stopped in ("stop", "fault"):
                 break
             self._log(f"broken off: {newest}")
             try:
-                failure = yield from self._way_back(newest.state)
+                state = newest.state if self.in_hand else (yield from self._retrace(newest))
+                return (yield from self._way_back(state, rise=(tries + 1) * LIFT))
             except _BrokenOff as again:
                 newest = again
-                continue
-            return failure if failure[0] else (broken.state.stopped, str(broken))
         return self._stands(newest)
+
+    def _retrace(self, broken: _BrokenOff) -> Generator[RobotCommand, RobotState, RobotState]:
+        """The empty hand goes back the way that it came, which was free."""
+        if broken.waypoints is None:
+            return broken.state
+        _, back = _back(densify(broken.waypoints, _RETRACED), self._arm(broken.state))
+        return (yield from self._do("go back the way it came", back, speed=_SLOW, guard=Guard(force=_RUB)))
 
     def _stands(self, broken: _BrokenOff) -> tuple[FailedStage, str]:
         """The arm stays where it is."""
@@ -167,11 +181,11 @@ class TransferRoutine:
         why = {"stop": "as asked", "fault": str(broken)}.get(stopped, f"the way back is barred: {broken}")
         return failed, f"stopped, {why}; in the hand: {self.in_hand or 'nothing'}"
 
-    def _way_back(self, state: RobotState) -> Steps:
+    def _way_back(self, state: RobotState, *, rise: float = 0.0) -> Steps:
         """From wherever the arm stands: what is held goes back to where it was taken from, the hand goes home."""
         at, q = self._under_way, self._arm(state)
         if at is None:
-            return (yield from self._home(self._world(MARGINS[-1].clearance), q))
+            return (yield from self._home(self._world(MARGINS[-1].clearance), q, rise=rise))
         if self.in_hand:
             state = yield from self._do("feel what is in the hand", width=0.0)
             if state.gripper_width > self._robot.gripper.closed_width + _EMPTY:
@@ -182,22 +196,25 @@ class TransferRoutine:
         if distance < _AWAY:
             yield from self._do("back off", back, speed=_SLOW)
             q = back[-1]
-        return (yield from self._home(at.world, q))
+        return (yield from self._home(at.world, q, rise=rise))
 
     def _put_back(self, at: _UnderWay, q: Floats) -> Steps:
         """What is held returns to where it was taken from, which is free and within reach."""
         pick = at.plan.pick
-        rise = straight_motion(at.world, q, raised(at.world.hand(q), LIFT), free=False)
-        rise = q[None] if rise is None else rise
-        with at.planner.holding(pick.hand):
-            carry = free_motion(at.world, rise[-1], pick.lift[-1], self._rng)
-        if carry is None:
-            return "release", f"no free way back; in the hand: {at.world.carried}"
-        yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
-        yield from self._do(f"carry {at.world.carried} back", carry)
+        distance, lower = _back(pick.lift, q)
+        if distance > _AWAY:
+            rise = straight_motion(at.world, q, raised(at.world.hand(q), LIFT), free=False)
+            rise = q[None] if rise is None else rise
+            with at.planner.holding(pick.hand):
+                carry = free_motion(at.world, rise[-1], pick.lift[-1], self._rng)
+            if carry is None:
+                return "release", f"no free way back; in the hand: {at.world.carried}"
+            yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
+            yield from self._do(f"carry {at.world.carried} back", carry)
+            lower = pick.lift[::-1]
         # Straight down the way it came, but for the last waypoint: from there on it is felt for. What has slid in the
         # hand hangs lower by nobody knows how much.
-        place, guard = Place(pick.hand, pick.lift[:0:-1]), Guard(force=_TOUCH + self._weight)
+        place, guard = Place(pick.hand, lower[: max(1, len(lower) - 1)]), Guard(force=_TOUCH + self._weight)
         return (yield from self._put_down(at, place, guard=guard, early=LIFT))
 
     def _go_home_first(self, state: RobotState) -> Steps:
@@ -219,6 +236,15 @@ class TransferRoutine:
             if self._tally.attempts == 0:
                 failure = planner.obstacle
         return failure
+
+    def _rehearse(self, why: str) -> Steps:
+        """Nothing moves: the whole plan is shown."""
+        rehearsal = Rehearsal(self._robot, self._table, self._objects, self._rng)
+        for command in rehearsal.commands((self._request.transfer, *self._request.then)):
+            state = yield command
+            if state.stopped:
+                raise _BrokenOff(state, command.label, None)
+        return "fault", f"{why}; {rehearsal.unreached}" if rehearsal.unreached else why
 
     def _execute(self, at: _UnderWay) -> Steps:
         world, plan, grasp = at.world, at.plan, at.plan.pick.hand.grasp
@@ -346,12 +372,15 @@ class TransferRoutine:
                 return q, True
         return q, False
 
-    def _home(self, world: CollisionWorld, q: Floats) -> Steps:
-        """Collision-free motion home; where something is too close, after a step straight up."""
+    def _home(self, world: CollisionWorld, q: Floats, *, rise: float = 0.0) -> Steps:
+        """Collision-free motion home; after a touch, or where something is too close, from straight above.
+
+        ``rise``: metres that the hand goes up first.
+        """
         began = time.perf_counter()
-        path = free_motion(world, q, self._robot.home, self._rng)
-        if path is None:
-            path = self._home_from_above(world, q)
+        path = self._home_from_above(world, q, rise) if rise else None
+        path = free_motion(world, q, self._robot.home, self._rng) if path is None else path
+        path = self._home_from_above(world, q, LIFT) if path is None else path
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
@@ -359,8 +388,8 @@ class TransferRoutine:
         self._under_way = None
         return "", ""
 
-    def _home_from_above(self, world: CollisionWorld, q: Floats) -> Floats | None:
-        rise = straight_motion(world, q, raised(world.hand(q), LIFT), free=False)
+    def _home_from_above(self, world: CollisionWorld, q: Floats, height: float) -> Floats | None:
+        rise = straight_motion(world, q, raised(world.hand(q), height), free=False)
         onward = None if rise is None else free_motion(world, rise[-1], self._robot.home, self._rng)
         return None if rise is None or onward is None else np.vstack([rise, onward])
 
@@ -417,7 +446,7 @@ class TransferRoutine:
         state = yield robot_command(self._robot, label, waypoints, speed=speed, width=width, guard=guard)
         self._tally.clock = state.time
         if state.stopped:
-            raise _BrokenOff(state, label)
+            raise _BrokenOff(state, label, waypoints if speed == FAST else None)
         return state
 
     def _outcome(self, failed_stage: FailedStage, reason: str) -> Outcome:

@@ -30,8 +30,9 @@ def read_robot(path: Path) -> Robot:
     """
     root = _whole(path)
     root.only(
-        "model", "remove", "change", "touching", "joints", "still", "gripper", "camera", "table", "floor", "workspace"
-    )
+        "model", "remove", "change", "touching", "joints", "views", "still", "gripper", "camera", "table", "floor",
+        "workspace",
+    )  # fmt: skip
     joints, gripper, workspace = root.section("joints"), root.section("gripper"), root.section("workspace")
     workspace.only("x", "y", "shoulder", "reach")
     each = [joints.section(name) for name in joints.values]
@@ -43,6 +44,7 @@ def read_robot(path: Path) -> Robot:
         velocity=np.array([joint.number("velocity", low=0) for joint in each]),
         acceleration=np.array([joint.number("acceleration", low=0) for joint in each]),
         home=np.array([joint.number("home") for joint in each]),
+        views=tuple(_view(section, joints) for section in root.sections("views")),
         still={joint.path.split(".")[-1]: joint.number("home") for joint in _still(root)},
         gripper=_gripper(gripper),
         hand=gripper.text("near"),
@@ -54,6 +56,8 @@ def read_robot(path: Path) -> Robot:
         shoulder=_pair(workspace, "shoulder"),
         reach=workspace.number("reach", low=0),
     )
+    if robot.views and not robot.camera.link:
+        root.refuse("the camera is on no link of the robot: no posture gives it another view", "views")
     _check(root, robot)
     return robot
 
@@ -124,6 +128,12 @@ def _changes(root: Section) -> dict[str, dict[str, dict[str, Any]]]:
     changes.only(*_KINDS)
     kinds = {kind: changes.section(kind) for kind in changes.values}
     return {kind: {name: dict(named.section(name).values) for name in named.values} for kind, named in kinds.items()}
+
+
+def _view(view: Section, joints: Section) -> Floats:
+    """Joint positions (J); those that are not named are as at home."""
+    view.only(*joints.values)
+    return np.array([view.number(name, joints.section(name).number("home")) for name in joints.values])
 
 
 def _still(root: Section) -> list[Section]:

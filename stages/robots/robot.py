@@ -109,6 +109,8 @@ class Robot:
     """J, limits, rad/s^2 (m/s^2)."""
     home: Floats
     """J, a posture that leaves the camera's view free."""
+    views: tuple[Floats, ...]
+    """Further postures, J each, from which the camera looks at the table."""
     still: dict[str, float]
     """Positions of joints that planning does not move."""
     gripper: Gripper
@@ -165,6 +167,16 @@ class Robot:
             return camera.T_link_camera
         T_base_link = self.body.link_poses(joint_names, positions)[camera.link]
         return T_base_link if camera.T_link_camera is None else T_base_link @ camera.T_link_camera
+
+    @cached_property
+    def camera_in_hand(self) -> bool:
+        """Whether the camera moves with the gripper."""
+
+        def held(q: Floats) -> Floats:
+            T_base_links = self.body.link_poses(self.joints, q)
+            return inverse(self.camera_pose(self.joints, q)) @ T_base_links[self.gripper.link]
+
+        return bool(np.allclose(held(self.home), held(self.home + 0.1), atol=1e-9))
 
     @cached_property
     def T_camera_base(self) -> Floats:

@@ -77,6 +77,16 @@ def _by_label(scene: SceneGraph) -> dict[str, list[str]]:
     return found
 
 
+def meant(answers: Mapping[str, str]) -> dict[str, str]:
+    """The names that objects have for those who have answered which one is meant, by the names they had."""
+    names = dict[str, str]()
+    for key, chosen in answers.items():
+        kind, _, wanted = key.partition(" ")
+        if kind == "which":
+            names |= {chosen: wanted, wanted: chosen}
+    return names
+
+
 def corrected(scene: SceneGraph, answers: Mapping[str, str], relate: Relate) -> SceneGraph:
     """A scene as those see it who have answered: what stands otherwise is turned, what is meant has its name."""
     turned = {
@@ -84,11 +94,7 @@ def corrected(scene: SceneGraph, answers: Mapping[str, str], relate: Relate) -> 
         for doubt in scene.doubts
         if answers.get(doubt.key) == "no" and doubt.T_base_other is not None
     }
-    names = dict[str, str]()
-    for key, chosen in answers.items():
-        kind, _, meant = key.partition(" ")
-        if kind == "which":
-            names |= {chosen: meant, meant: chosen}
+    names = meant(answers)
     if not turned and all(a == b for a, b in names.items()):
         return scene
     objects = tuple(

@@ -107,6 +107,32 @@ def in_region(virtual: VirtualObject, T_base_parent: Floats, T_base_child: Float
     return bool(np.linalg.norm(centres - T_base_child[:2, 3], axis=1).min() <= virtual.radius)
 
 
+def rerooted(goal: SceneGraph, root: str) -> SceneGraph:
+    """The same neighbours told from ``root``, which is beside nothing then.
+
+    Which of two neighbours is beside the other is a matter of telling; who can be placed first is not. Where the old
+    child is turned as in the goal, its old parent in the new region means the old child in the old one.
+    """
+    regions = {item.child: item for item in goal.virtual_objects}
+    turned: dict[str, VirtualObject] = {}
+    while root in regions:
+        old = regions[root]
+        turned[old.name] = VirtualObject(
+            name=f"{old.parent}_near_{root}",
+            parent=root,
+            child=old.parent,
+            T_parent_virtual=inverse(old.T_parent_virtual),
+            radius=old.radius,
+        )
+        root = old.parent
+    kept = tuple(item for item in goal.assertions if turned.keys().isdisjoint(item.arguments))
+    return msgspec.structs.replace(
+        goal,
+        virtual_objects=tuple(turned.get(item.name, item) for item in goal.virtual_objects),
+        assertions=(*kept, *assertions(tuple(turned.values()))),
+    )
+
+
 def without(goal: SceneGraph, names: set[str]) -> SceneGraph:
     """The part of a goal that does without some of its objects, what rests on or in these and regions beside them."""
     gone = set(names)

@@ -49,7 +49,7 @@ def card(kept: Remembered, actions: tuple[Action, ...], words: Words) -> Card:
     """What there is to see of a goal, and beside ``actions`` what can be done with one that is on disk."""
     goal, name = kept.goal, kept.goal.name
     names = [item.name for item in goal.scene.objects]
-    text = words.say("goal", count=len(names), objects=words.nouns(names))
+    text = words.say("goal" if len(names) > 1 else "goal_of_one", count=len(names), objects=words.nouns(names))
     if kept.file is None:
         return Card(name, name, text, kept.photo, actions)
     file = File(_key(kept.file.tobytes()), f"{name}.zip", words.say("do_export"), kept.file)

@@ -9,10 +9,32 @@ from stages.story.words import Words
 _NAMES = r"(?P<names>\w+(?:, \w+)*)"
 _ITEM, _OTHER, _PLACE = r"(?P<item>\w+)", r"(?P<other>\w+)", r"(?P<place>\w+)"
 _NUMBER, _OF = r"(?P<number>[\d.]+)", r"(?P<of>[\d.]+)"
+_TEXT = r"'(?P<text>[^']*)'"
+_WAY = r" on the way to [\w ]+"
+"""Which motion was broken off."""
 REASONS = {
+    "answered": r"question=\d+: (?:nothing|\d+) is asked now",
+    "busy": r"busy: waits for [\w' ]+; ask again after the verdict",
+    "no_goal": rf"name={_TEXT}: no such goal.*",
+    "taken": rf"\w+={_TEXT}: there is a goal of that name.*",
+    "no_name": rf"\w+={_TEXT}: must consist of letters, digits, - and _ only",
+    "no_file": r"file: is no goal: .*",
+    "idle": r"nothing is under way",
+    "no_go": r"nothing waits for go",
+    "no_arm": r"the arm is not under way",
+    "beside": r"x=\S+ y=\S+: beside the table; .*",
+    "no_answer": r"\S+: no answer to 'call' within \d+ s",
     "stopped_empty": r"stopped, as asked; in the hand: nothing",
     "stopped_holding": rf"stopped, as asked; in the hand: {_NAMES}",
     "stopped": r"stopped, as asked",
+    "stopped_on_the_way": rf"\bas asked(?:{_WAY})?",
+    "hand_empty": r"; in the hand: nothing",
+    "hand_holding": rf"; in the hand: {_NAMES}",
+    "barred": r"stopped, the way back is barred: ",
+    "slipped": rf"(?:\bslip: )?the fingers are [\d.]+ mm apart{_WAY}",
+    "pushed": rf"(?:\btouch: )?(?:[\d.]+ N at the hand|a joint is [\d.]+ degrees off){_WAY}",
+    "knocked_over": rf"; knocked over: {_NAMES}",
+    "else_holds": r"; every other relation of the goal holds",
     "too_few": rf"{_NUMBER} of {_OF} objects seen",
     "floats": rf"not seen: what carries {_NAMES}",
     "unseen": rf"not seen: {_NAMES}",
@@ -40,6 +62,11 @@ REASONS = {
     "not_clear": rf"clear\({_ITEM}\) does not hold",
     "not_there": rf"exist\({_ITEM}\) does not hold",
     "not_seen_on": rf"{_ITEM} is not seen on or in {_OTHER}",
+    "not_felt": rf"(?:\bunknown: )?nothing was felt below {_ITEM} where it was let go of",
+    "not_perceived": rf"{_ITEM} is not in the perceived scene",
+    "no_room_aside": rf"no room to put {_ITEM} aside",
+    "hides_same": rf"wherever {_ITEM} could be put, it would hide the same",
+    "no_way_back": r"no free way back",
     "closed": rf"the fingers closed to {_NUMBER} mm instead of {_OF}",
     "opened": rf"the hand opened to {_NUMBER} mm of {_OF}",
     "not_home": r"no free motion home; too close: .*",
@@ -59,7 +86,7 @@ REASONS = {
     "at_release": r"\brelease: ",
 }
 """What stages say, by the key of what people are told instead. The longer comes first."""
-_NUMBERS = ("number", "of")
+_AS_SAID = ("number", "of", "text")
 
 
 def told(reason: str, words: Words) -> str:
@@ -71,5 +98,5 @@ def told(reason: str, words: Words) -> str:
 
 def _parts(match: re.Match[str], words: Words) -> dict[str, object]:
     return {
-        name: text if name in _NUMBERS else words.nouns(text.split(", ")) for name, text in match.groupdict().items()
+        name: text if name in _AS_SAID else words.nouns(text.split(", ")) for name, text in match.groupdict().items()
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -28,6 +28,7 @@ from runner.page.story import (
     Told,
     View,
 )
+from stages.geometry.poses import inverse
 from stages.messages import (
     Answer,
     Arrange,
@@ -53,11 +54,12 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.correction import OWN_ARM
+from stages.messages.correction import CAMERAS_WAY, OWN_ARM
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.messages.task import Question as AskedQuestion
 from stages.scene.catalogue import Catalogue
+from stages.scene.doubts import meant
 from stages.scene.goals import GoalFolder
 from stages.scene.text import support
 from stages.story import reasons
@@ -71,7 +73,7 @@ STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
 SHOWN_FAULTS = 4
 """Relations that do not hold, of a goal that was not reached."""
-Phase = Literal["look", "show", "recognise", "teach", "restore", "check", "plan", "move"]
+Phase = Literal["look", "show", "turn", "recognise", "teach", "restore", "check", "plan", "move"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,8 @@ class Job:
     stopping: bool = False
     question: AskedQuestion | None = None
     """Waits for an answer."""
+    answers: Mapping[str, str] = field(default_factory=dict[str, str])
+    """What was answered, by key of the doubt. Never changed, only replaced."""
     asks: bool = False
     """The first plan is to wait for go."""
     waits: bool = False
@@ -130,6 +134,7 @@ class Story:
         self._photo: Photo | None = None
         self._moved = False
         """Whether something was moved since the picture was taken."""
+        self._recognised: SceneEstimate | None = None
         self._estimate: SceneEstimate | None = None
         self._scene: SceneGraph | None = None
         self._ended: tuple[Goal | Verdict, str] | None = None
@@ -149,17 +154,17 @@ class Story:
             case Teach() | Restore() | Look() as command:
                 self._ask(command, heard)
             case LookRequest(purpose=look) | Frame(name=look) if look.startswith(OWN_ARM):
-                self._at("show")
+                self._at("turn" if look == CAMERAS_WAY else "show")
             case LookRequest():
                 if not heard.id.startswith(f"{CORRECTOR}."):  # which passes on what was heard before
                     self._begin(heard)
             case Frame() as frame:
                 self._photo = Photo(heard.id.replace("#", "-"), frame.rgb)
-                self._estimate = self._scene = None
+                self._recognised = self._estimate = self._scene = None
                 self._moved = False
                 self._at("recognise")
             case SceneEstimate() as estimate:
-                self._estimate = estimate
+                self._recognised = self._estimate = estimate
             case SceneGraph() as scene:
                 self._see(scene)
             case Move() as move:
@@ -183,6 +188,7 @@ class Story:
             case Stop():
                 self._job = replace(self._job, stopping=True)
             case Task(current=scene):
+                self._agree(scene, self._job.answers)
                 holders = {item.name for item in scene.objects if self._catalogue[item.label].concave}
                 self._job = replace(self._job, phase="plan", holders=frozenset(holders))
             case Plan(transfers=transfers):
@@ -198,6 +204,12 @@ class Story:
                 self._job = replace(self._job, done=outcome.number)
             case _:
                 self._job = _talked(self._job, heard.message)
+
+    def _agree(self, scene: SceneGraph, answers: Mapping[str, str]) -> None:
+        """The scene that is planned in: names and stances are what the person has answered, what is hidden is known."""
+        self._scene = scene
+        if self._recognised is not None and answers:
+            self._estimate = _as_answered(self._recognised, scene, meant(answers))
 
     def _step(self, time_ns: int) -> None:
         """A transfer begins: how long steps take is learned from one to the next."""
@@ -278,6 +290,11 @@ class Story:
             cards_actions=(add(words),) if self._folder else (),
         )
 
+    def say(self, refusal: str, language: Language) -> str:
+        """Why a stage refused a call, as a sentence."""
+        words = words_of(language)
+        return words.capital(reasons.told(refusal, words))
+
     def _cards(self, words: Words) -> Iterator[Card]:
         for name, kept in self._goals.items():
             asked = {"name": name, "ask": "true"}
@@ -321,14 +338,14 @@ class Story:
             Action(
                 DEMONSTRATOR,
                 "answer",
-                words.bare(choice) if choice in names else words.say(f"answer_{choice}"),
+                words.capital(words.bare(choice)) if choice in names else words.say(f"answer_{choice}"),
                 {"question": str(asked.number), "choice": choice},
                 kind="first" if choice == doubt.choices[0] and doubt.kind != "which" else "plain",
             )
             for names in [_names(self._scene)]
             for choice in doubt.choices
         )
-        about = region_name(0) if doubt.kind == "unknown" else doubt.object
+        about = {"unknown": region_name(0), "stance": doubt.object, "which": ""}[doubt.kind]
         return Question(words.say(key, object=noun), answers, about)
 
     def _view(self, words: Words) -> View | None:
@@ -352,7 +369,7 @@ class Story:
             places[transfer.object] = end
 
     def _statements(self, words: Words) -> Iterator[Statement]:
-        if self._moved and self._job is None:
+        if self._moved and self._job is None and self._photo:
             yield Statement(words.say("moved"), surety="unknown")
         elif self._scene is not None:
             yield from self._known(self._scene, words)
@@ -384,12 +401,12 @@ class Story:
         if self._job is not None and self._job.pausing and not self._job.waits:
             yield Action(DEMONSTRATOR, "go", words.say("do_no_pause"), {})
         yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {"ask": "true"}, ask, kind="first", now=idle)
-        yield Action(DEMONSTRATOR, "look", words.say("do_look"), {}, now=idle)
+        yield Action(DEMONSTRATOR, "look", words.say("do_look" if self._photo else "do_first_look"), {}, now=idle)
         if self._simulated:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        moves = self._brakes and self._job is not None and self._job.phase in ("move", "show")
+        moves = self._brakes and self._job is not None and self._job.phase in ("move", "show", "turn")
         who = EXECUTOR if moves else DEMONSTRATOR
         yield Action(who, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
 
@@ -473,13 +490,28 @@ def _talked(job: Job, message: Message) -> Job:
         case Answer(question=number, choice=choice):
             asked = job.question
             taken = asked is not None and asked.number == number and choice in asked.doubt.choices
-            return replace(job, question=None) if taken else job
+            answers = job.answers if choice == "again" or asked is None else {**job.answers, asked.doubt.key: choice}
+            return replace(job, question=None, answers=answers) if taken else job
         case Pause():
             return replace(job, pausing=True)
         case Go():
             return replace(job, pausing=False, waits=False, asks=False)
         case _:
             return job
+
+
+def _as_answered(estimate: SceneEstimate, scene: SceneGraph, names: Mapping[str, str]) -> SceneEstimate:
+    """What was seen, with the names and poses that it has in a scene, for a picture of it."""
+    there = {item.name: item.T_base_object for item in scene.objects}
+    to_camera = None if estimate.T_base_camera is None else inverse(estimate.T_base_camera)
+
+    def answered(item: ObjectPose) -> ObjectPose:
+        name = names.get(item.name, item.name)
+        if to_camera is None or item.contradicted or name not in there:
+            return msgspec.structs.replace(item, name=name)
+        return msgspec.structs.replace(item, name=name, T_camera_object=to_camera @ there[name])
+
+    return msgspec.structs.replace(estimate, objects=tuple(map(answered, estimate.objects)))
 
 
 def _move(transfer: Transfer, job: Job, words: Words) -> str:

@@ -1,5 +1,6 @@
 """How episodes are told: a row, an object of JSON, and what is counted over all."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,12 @@ def test_a_summary_says_what_was_claimed_and_what_is_true() -> None:
     assert expected.items() <= found.items()
 
 
+def test_a_refusal_is_one_where_nothing_moved() -> None:
+    refused = replace(episode(claimed=False, true=False), outcomes=())
+    assert refused.refused and not episode(claimed=False, true=False).refused
+    assert not replace(episode(claimed=True, true=True), outcomes=()).refused
+
+
 def test_a_failure_names_the_stage_of_the_verdict_and_a_success_none() -> None:
     assert episode(claimed=False, true=True).summary()["failing_stage"] == "planner"
     good = episode(claimed=True, true=True).summary()
@@ -45,7 +52,8 @@ def test_rows_fit_their_header_and_all_is_counted() -> None:
     assert "| 7 | 1 | 1 of 2 | 1 of 2 | 1 | 1 of 1 | 3 | 31 s | COMPLETE |" in row(bad)
     assert row(episode(claimed=True, true=True)).count("|") == HEADER.splitlines()[0].count("|")
     assert totals([bad, episode(claimed=True, true=False), episode(claimed=True, true=True)]) == (
-        "1 of 3 restored; in truth 1, false successes 1, objects lost 2, 2 of them unsaid"
+        "1 of 3 restored, 0 refused before anything moved; "
+        "in truth 1, false successes 1, objects lost 2, 2 of them unsaid"
     )
 
 

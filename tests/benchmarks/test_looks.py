@@ -3,10 +3,10 @@
 import msgspec
 import numpy as np
 
-from benchmarks.looks import Judge, as_seen
+from benchmarks.looks import Judge, Tally, as_seen, visible_shares
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import exp_so3, inverse, pose
-from stages.messages import SceneGraph, SensorErrors, Snapshot
+from stages.messages import Frame, SceneGraph, SensorErrors, Snapshot
 from stages.messages.scene import Assertion, SceneObject
 from stages.robots import BUILT_IN as FETCH
 from stages.robots import read_robot
@@ -41,6 +41,32 @@ def test_what_is_missed_false_beside_its_place_and_wrongly_related_is_said() -> 
     found = perceived(seen, Assertion(predicate="on", arguments=("tea_box", "table")))
     wrong = ["missed bowl", "1 false", "cup 30 mm 0 deg", "not on(cup, table)"]
     assert Judge(CATALOGUE).wrong(true, true, found) == wrong
+
+
+def test_what_became_of_objects_is_told_by_how_much_of_them_shows() -> None:
+    true = snapshot(tea_box=0.5, cup=0.7, bowl=0.9)
+    found = perceived({"tea_box": standing("tea_box", 0.51), "cup": standing("cup", 0.73), "plate": np.eye(4)})
+    tally = Tally()
+    tally.add(Judge(CATALOGUE).found(true, found), (1.0, 0.3, 0.0), len(found.objects))
+    assert tally.lines() == [
+        "of which shows >= 50%  1 right, 0 elsewhere or turned, 0 missed",
+        "of which shows >= 25%  0 right, 1 elsewhere or turned, 0 missed",
+        "of which shows >= 10%  0 right, 0 elsewhere or turned, 0 missed",
+        "of which shows >= 0%   0 right, 0 elsewhere or turned, 1 missed",
+        "1 false",
+    ]
+
+
+def test_what_stands_before_another_object_hides_it() -> None:
+    true = snapshot(cereal_box=0.6, cup=0.68)
+    K, T_base_camera = ROBOT.camera.K, ROBOT.camera_pose(true.joint_names, true.joint_positions)
+    depth = np.zeros(ROBOT.camera.size[::-1], np.float32)
+    look = Frame(
+        rgb=np.zeros((*depth.shape, 3), np.uint8), depth=depth, K=K, T_base_camera=T_base_camera, robot_mask=None,
+        name="look", index=0, total=1,
+    )  # fmt: skip
+    box, cup = visible_shares(true, look, CATALOGUE)
+    assert box == 1.0 and cup < 0.5
 
 
 def test_the_cameras_own_errors_are_none_of_perceptions() -> None:

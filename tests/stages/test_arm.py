@@ -135,9 +135,13 @@ def test_nothing_moves_without_the_operators_word(settings: dict[str, bool], say
             one for one in run_stage(stage, [turn(0.2, 0.4), turn(0.2, 0.4, width=0.0)]) if isinstance(one, RobotState)
         ]
         wait_until(lambda: len(ghosts) == 2)
-    assert (first.stopped, second.stopped, second.reason) == ("", "fault", says)
+        state = state_of(stage, still(), turn(0.3, 0.4))
+        wait_until(lambda: len(ghosts) == 3)
+    assert (first.stopped, second.stopped, second.reason) == ("", "fault", says) and first.shown
+    assert state.shown and state.reason == says
     assert np.allclose(second.positions[:6], HOME), "the encoders are what they are"
     assert not robot.arm.goals and not robot.gripper.goals
+    assert [len(one.message.trajectory) for one in ghosts] == [1, 2, 1], "all since the encoders were read"
     shown = ghosts[0].message.trajectory[0].joint_trajectory
     assert list(shown.joint_names) == list(NAMES) and shown.points[-1].positions[-1] == pytest.approx(HOME[-1] + 0.2)
 
@@ -214,6 +218,25 @@ def test_what_goes_wrong_is_one_line(what: str, stopped: str, says: str) -> None
     assert state.stopped == stopped and re.search(says, state.reason) and "\n" not in state.reason
     assert moved == (what not in ("rejected", "no finger", "old", "moved"))
     assert what != "quiet" or robot.arm.canceling, "what cannot be watched is not let go on"
+
+
+@pytest.mark.parametrize("what", ["rejected", "aborted", "gripper", "no finger", "old", "quiet"])
+def test_once_it_is_mended_the_next_command_is_carried_out(what: str) -> None:
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint) as stage:
+        broken(robot, what)
+        assert state_of(stage, turn(0.2, 1.0, guard=Guard(), width=0.02)).stopped == "fault"
+        wait_until(lambda: not robot.arm.busy)
+        mended(robot)
+        robot.q = HOME.copy()
+        state = state_of(stage, turn(0.2, 0.4, guard=Guard(), width=0.02))
+    assert (state.stopped, state.reason) == ("", "")
+    assert state.positions[5] == pytest.approx(HOME[-1] + 0.2, abs=1e-3)
+
+
+def mended(robot: FakeRobot) -> None:
+    """Everything as it should be."""
+    robot.arm.accepts, robot.abort, robot.gripper.silent = True, None, False
+    robot.without_finger, robot.behind, robot.quiet = False, 0.0, False
 
 
 def test_an_arm_that_tells_no_efforts_feels_no_force_and_says_so_once() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -10,10 +11,11 @@ from runner.contract import Refused
 from stages.corrector import Corrector, Phase, State
 from stages.estimate import Quiet
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import rotation_angle
+from stages.geometry.poses import inverse, rotation_angle
 from stages.messages import Arrived, Calibrate, Correction, Frame, LookRequest, PostureRequest
 from stages.messages.robot import Stopped
-from stages.robots import BUILT_IN
+from stages.perception.rendering.rasteriser import View
+from stages.robots import BUILT_IN, Robot, read_robot
 
 HAND_CAMERA = BUILT_IN.with_name("ur5e_hand.yaml")
 CTX = Quiet()
@@ -62,6 +64,54 @@ def test_a_camera_in_the_hand_is_taken_as_it_is_and_told_why() -> None:
     assert passed == LOOK
     with pytest.raises(Refused, match="in the hand"):
         corrector.on_calibrate(Calibrate(), CTX)
+
+
+def test_a_look_from_elsewhere_waits_until_the_arm_has_brought_the_camera_there() -> None:
+    corrector = Corrector(Corrector.Config(robot=HAND_CAMERA, calibrate=False))
+    robot = read_robot(HAND_CAMERA)
+    aside, home = LookRequest(purpose="goal, from view 1", view=1), LookRequest(purpose="goal")
+    (survey,) = corrector.on_look_request(aside, CTX)
+    assert survey == LookRequest(purpose="own arm: what is in the way of the camera")
+    (posture,) = corrector.on_frame(table(robot), CTX)
+    assert isinstance(posture, PostureRequest) and np.array_equal(posture.positions, robot.views[0])
+    assert list(corrector.on_arrived(arrived(), CTX)) == [aside]
+    assert list(corrector.on_look_request(aside, CTX)) == [aside], "it is there"
+    assert list(corrector.on_look_request(home, CTX)) == [survey]
+    (back,) = corrector.on_frame(table(robot), CTX)
+    assert isinstance(back, PostureRequest) and np.array_equal(back.positions, robot.home)
+    assert list(corrector.on_arrived(arrived(success=False, stopped="touch"), CTX)) == [home], "from where it stands"
+    assert list(corrector.on_look_request(home, CTX)) == [survey], "which is not home"
+
+
+def test_a_camera_that_sees_no_table_stays_where_it_is() -> None:
+    corrector = Corrector(Corrector.Config(robot=HAND_CAMERA, calibrate=False))
+    aside = LookRequest(purpose="goal, from view 1", view=1)
+    list(corrector.on_look_request(aside, CTX))
+    assert list(corrector.on_frame(frame(), CTX)) == [aside]
+
+
+def test_whoever_stops_the_arm_on_its_way_to_a_view_gets_no_look() -> None:
+    corrector = Corrector(Corrector.Config(robot=HAND_CAMERA, calibrate=False))
+    list(corrector.on_look_request(LookRequest(purpose="goal", view=2), CTX))
+    list(corrector.on_frame(table(read_robot(HAND_CAMERA)), CTX))
+    assert not list(corrector.on_arrived(arrived(success=False, stopped="stop"), CTX))
+
+
+def test_a_view_that_the_robot_does_not_have_is_refused() -> None:
+    with pytest.raises(Refused, match=r"view 1: .*fetch\.yaml has 0; demonstrator\.robot must be the same"):
+        list(Corrector(Corrector.Config(calibrate=False)).on_look_request(LookRequest(purpose="goal", view=1), CTX))
+
+
+def table(robot: Robot) -> Frame:
+    """An empty one, from home."""
+    width, height = robot.camera.size
+    T = inverse(robot.T_camera_base)
+    rays = View.of(robot.camera.K, width, height).rays() @ T[:3, :3].T
+    depth = (robot.table.height - T[2, 3]) / rays[..., 2]
+    return msgspec.structs.replace(
+        frame(T_base_camera=T), rgb=np.zeros((height, width, 3), np.uint8), depth=depth.astype(np.float32),
+        K=robot.camera.K,
+    )  # fmt: skip
 
 
 def test_a_camera_of_which_nobody_knows_where_it_stands_is_taken_as_it_is() -> None:

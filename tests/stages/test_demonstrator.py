@@ -36,6 +36,7 @@ from stages.messages import (
 )
 from stages.messages.scene import Doubt, SceneObject
 from stages.messages.task import STOPPED
+from stages.robots import BUILT_IN
 from stages.scene.virtual import without
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout
@@ -145,6 +146,32 @@ def test_shows_disturbs_and_restores_a_goal() -> None:
     verdict = the_verdict(episode.seen(GOAL))
     assert verdict.success and not verdict.violated and len(verdict.satisfied) == len(GOAL.assertions)
     assert (verdict.looks, verdict.plans, verdict.transfers) == (3, 1, 1)
+
+
+def test_a_new_scene_is_looked_at_from_all_views_and_what_one_shows_is_there() -> None:
+    episode = Episode(robot=BUILT_IN.with_name("ur5e_hand.yaml"))
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    part = without(GOAL, {"cup"})
+    above = pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    somewhere = msgspec.structs.replace(BLIND, T_camera_table=above, T_base_camera=inverse(above))
+    (aside,), (other,) = episode.seen(GOAL), episode.seen(part, somewhere)
+    goal, _ = episode.seen(part, somewhere)
+    assert isinstance(goal, Goal) and {item.name for item in goal.scene.objects} == {"tray", "cup", "soup_can"}
+    episode.arranged()
+    episode.seen(START)
+    episode.seen(START)
+    (task,) = episode.seen(START)
+    looks = [message for message in episode.sent if isinstance(message, LookRequest)]
+    assert [(look.purpose, look.view) for look in looks] == [
+        (f"{kind}{where}", view)
+        for kind in ("goal", "start")
+        for where, view in ((", from view 1", 1), (", from view 2", 2), ("", 0))
+    ]
+    assert (aside, other) == (looks[1], looks[2]) and isinstance(task, Task)
+    episode.planned(STEP)
+    assert episode.ended(1, STEP) == [LookRequest(purpose="after transfer 1")], "what is known is looked at from home"
+    assert episode.seen(part)[0] == LookRequest(purpose="after transfer 1, look 2, from view 1", view=1)
 
 
 def test_what_was_knocked_over_is_named_though_every_relation_holds() -> None:

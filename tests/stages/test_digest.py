@@ -221,17 +221,34 @@ def test_what_lies_flat_is_found_too(filter_stage: ParticleFilter) -> None:
     assert sorted(item.label for item in estimate.objects) == ["tea_box", "tray"]
 
 
-def test_what_others_hid_from_the_look_at_it_alone_is_found_by_revising(filter_stage: ParticleFilter) -> None:
-    heap = {"tray": upright("tray", 0.0, 0.0, 0.3), "cereal_box": upright("cereal_box", -0.08, -0.03, 0.5)}
-    heap |= {"bowl": upright("bowl", 0.09, -0.02, 0.0), "milk_carton": upright("milk_carton", 0.02, 0.05, 0.2)}
+def test_what_the_looks_at_each_alone_missed_is_found_by_revising(filter_stage: ParticleFilter) -> None:
+    """Others may hide an object from the look at it alone, so that no first hypothesis has it."""
+    heap = {"tray": upright("tray", 0.0, 0.0, 0.3), "bowl": upright("bowl", 0.09, -0.02, 0.0)}
+    heap |= {"milk_carton": upright("milk_carton", 0.02, 0.05, 0.2)}
     laden = render(heap)
     found = candidates(*((label, laden.boxes[label], 0.9) for label in heap))
-    for revisions, labels in ((0, set(heap) - {"tray"}), (1, set(heap))):
+    for revisions, labels in ((0, set(heap) - {"bowl"}), (1, set(heap))):
         config = Hypotheses.Config(n_objects="auto", finalists=1, revisions=revisions)
-        (observation, *hypotheses), _ = enumerate_(config, frame(laden), found, filter_stage)
-        estimate = ranked(config, hypotheses, filter_stage, observation)
+        (observation, begun), _ = enumerate_(config, frame(laden), found, filter_stage)
+        seen = [k for k, candidate in enumerate(begun.candidates) if candidate.label != "bowl"]
+        fields = {name: tuple(getattr(begun, name)[k] for k in seen) for name in ("candidates", "starts", "charges")}
+        missed = msgspec.structs.replace(begun, charged=sum(fields["charges"]), **fields)
+        estimate = ranked(config, [missed], filter_stage, observation)
         assert {item.label for item in estimate.objects} == labels
         assert len(estimate.log_weights) == 1 + revisions
+
+
+def test_what_a_box_leaves_unexplained_may_be_an_object_by_another_label(
+    seen: Rendered, filter_stage: ParticleFilter
+) -> None:
+    wrong = candidates(("tuna_can", seen.boxes["mug"], 0.7), ("tea_box", seen.boxes["tea_box"], 0.95))
+    doubted = msgspec.structs.replace(wrong.candidates[0], others=("sponge", "mug"))
+    config = Hypotheses.Config(n_objects="auto")
+    for first, label in ((wrong.candidates[0], "tuna_can"), (doubted, "mug")):
+        found = msgspec.structs.replace(wrong, candidates=(first, wrong.candidates[1]))
+        (observation, *hypotheses), _ = enumerate_(config, frame(seen), found, filter_stage)
+        estimate = ranked(config, hypotheses, filter_stage, observation)
+        assert {item.label for item in estimate.objects} == {label, "tea_box"}
 
 
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:

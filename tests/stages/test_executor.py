@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +165,32 @@ def test_other_robots_pick_and_place_by_their_descriptions_alone(robot: Path) ->
     assert bench.is_home()
 
 
+def test_an_arm_that_only_shows_is_shown_the_whole_plan() -> None:
+    poses = {"soup_can": standing("soup_can", 0.6, 0.1), "tuna_can": standing("tuna_can", 0.65, -0.15)}
+    first, second = (
+        Transfer(object=name, source="table", destination="table", T_base_targets=target[None], pick="", place="")
+        for name, target in (("soup_can", standing("soup_can", 0.6, -0.3)), ("tuna_can", poses["soup_can"]))
+    )
+    executor = Executor(Executor.Config(catalogue=CATALOGUE_FILE))
+    ctx, home = StepContext(np.random.default_rng(0)), tuple(ROBOT.joints)
+    request = TransferRequest(transfer=first, scene=graph(poses, ROBOT.table.height), number=1, then=(second,))
+    still = RobotState(
+        joint_names=home, positions=ROBOT.home, gripper_width=0.1, time=0.0, reason="nothing moves", shown=True
+    )
+    shown: list[RobotCommand] = []
+    answer = executor.on_transfer_request(request, ctx)
+    while isinstance(answer, RobotCommand):
+        shown.append(answer)
+        answer = executor.on_robot_state(still, ctx)
+    assert isinstance(answer, Outcome)
+    assert (answer.failed_stage, answer.reason, answer.held) == ("fault", "nothing moves", "")
+    moving = shown[1:]
+    assert [one.label for one in moving if "reach" in one.label] == ["reach for soup_can", "reach for tuna_can"]
+    assert all(np.allclose(b.positions[0], a.positions[-1], atol=1e-6) for a, b in pairwise(moving)), "without a gap"
+    assert np.allclose(moving[0].positions[0], ROBOT.home) and np.allclose(moving[-1].positions[-1], ROBOT.home)
+    assert all(one.gripper_width is None for one in moving)
+
+
 def test_an_unreachable_object_fails_in_ik() -> None:
     bench = Bench(0, "tea")
     poses = bench.poses() | {"cup": standing("cup", 1.10, 0.5)}
@@ -226,6 +253,30 @@ def test_a_stop_reaches_the_arm_on_its_way_and_what_it_held_goes_back() -> None:
     assert isinstance(home, Outcome) and (home.success, home.number, home.held) == (True, 0, "")
     assert bench.is_home()
     assert np.linalg.norm(bench.poses()["soup_can"][:3, 3] - before["soup_can"][:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize(("label", "seconds", "error"), [("lift cup", 7.97, 7971), ("go home", 26.47, 26471)])
+def test_an_arm_that_is_called_home_right_after_a_stop_gets_there(label: str, seconds: float, error: int) -> None:
+    """Stopped while lifting it held the cup where no free motion began; on its way home it felt its own jerk."""
+    bench = Bench(1, "breakfast")
+    before, rng, doing = bench.poses(), np.random.default_rng(error), list[str]()
+    seen = {name: misperceived(T, rng) for name, T in before.items()}
+    target = seen["cup"].copy()
+    target[1, 3] += 0.1 if target[1, 3] < 0 else -0.1
+    stopping = bench.simulation.time + seconds
+
+    def stop(label: str) -> None:
+        if not doing and bench.simulation.time > stopping:
+            doing.append(label)
+            bench.world.on_brake(bench.executor.on_stop(Halt(), bench.ctx))
+
+    bench.meddle = stop
+    assert bench.transfer(seen, "cup", "table", target).failed_stage == STOPPED and doing == [label]
+    home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
+    assert isinstance(home, Outcome) and (home.success, home.reason, home.held) == (True, "", "")
+    assert bench.is_home()
+    stands = before["cup"] if label == "lift cup" else target
+    assert np.linalg.norm(bench.poses()["cup"][:3, 3] - stands[:3, 3]) < 0.02
 
 
 def test_the_arm_may_be_stopped_on_its_way_into_a_posture_and_comes_home() -> None:
@@ -310,6 +361,27 @@ def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> N
     after = bench.poses()
     assert np.linalg.norm(after["cup"][:3, 3] - before["cup"][:3, 3]) < 0.02
     assert after["tea_box"][2, 2] > 0.99
+
+
+def test_what_somebody_puts_in_the_way_home_is_felt_and_another_way_is_found() -> None:
+    bench, hand = Bench(0, "breakfast"), list[Floats]()
+
+    def bar(label: str) -> None:
+        if label != "go home" or len(hand) == 3:
+            return
+        hand.append(bench.simulation.hand()[:2])
+        if len(hand) == 3:
+            ahead = (hand[2] - hand[1]) / np.linalg.norm(hand[2] - hand[1])
+            bench.simulation.place("milk_carton", standing("milk_carton", *(hand[2] + 0.1 * ahead)), settle=0.0)
+
+    bench.meddle = bar
+    outcome = bench.transfer(bench.poses(), "cup", "table", standing("cup", 0.62, -0.30))
+    assert (outcome.failed_stage, outcome.held) == ("unknown", "")
+    assert "on the way to go home" in outcome.reason
+    assert bench.is_home()
+    after = bench.poses()
+    assert np.linalg.norm(after["cup"][:2, 3] - [0.62, -0.30]) < 0.02
+    assert after["milk_carton"][2, 2] > 0.99
 
 
 def test_states_between_transfers_are_ignored() -> None:

@@ -17,7 +17,7 @@ from stages.planner import Planner
 from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
 from stages.scene.stance import Standing, yawed
-from stages.scene.virtual import satisfied
+from stages.scene.virtual import rerooted, satisfied
 from tests.stages.episodes import Recorded
 from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
 from tests.stages.planning.scenes import ROBOT
@@ -191,11 +191,12 @@ def test_nothing_is_placed_beside_what_is_still_to_be_picked():
     assert [transfer.object for transfer in plan(crowded_goal(), start).transfers] == ["tea_box", "water_bottle"]
 
 
-def test_a_neighbour_that_keeps_the_hand_away_is_put_aside_first():
-    """The bottle is where it belongs, and so near that no grasp of the tea box has room."""
+def test_a_neighbour_that_keeps_the_hand_away_is_moved_first():
+    """The bottle is where it belongs, and so near that no grasp of the tea box has room; it belongs as well on the
+    other side of the sugar box."""
     stuck = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", -0.08, -0.1)
     found = plan(crowded_goal(), stuck)
-    assert [transfer.object for transfer in found.transfers] == ["water_bottle", "tea_box", "water_bottle"]
+    assert [transfer.object for transfer in found.transfers] == ["water_bottle", "tea_box"]
     assert reached(crowded_goal(), executed(stuck, found))
 
 
@@ -204,6 +205,26 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]
     again = [transfer.key for transfer in plan(crowded_goal(), near, avoid=("tea_box: table -> tray",)).transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
+
+
+def test_of_two_that_stand_close_the_one_that_leaves_the_hand_room_is_placed_last():
+    """The goal has the tea box beside the bottle; with the bottle there, no finger fits between them."""
+    goal = (
+        Layout().put("bowl", 0.046, -0.314).put("water_bottle", 0.145, -0.216).put("tea_box", 0.114, -0.147, yaw=1.62)
+    )
+    start = Layout().put("bowl", 0.05, 0.295).put("water_bottle", -0.02, 0.0).put("tea_box", 0.12, -0.259, yaw=-1.06)
+    found = plan(goal, start)
+    assert [transfer.object for transfer in found.transfers] == ["water_bottle", "bowl"]
+    assert reached(goal, executed(start, found))
+
+
+def test_what_may_stand_anywhere_leaves_room_for_what_may_not():
+    """The can belongs beside the tray, where the bowl above it would go first."""
+    goal = Layout().put("tray", 0.12, -0.216, yaw=3.43).put("tuna_can", 0.048, -0.032).put("bowl", 0.006, 0.171)
+    start = Layout().put("tray", 0.102, 0.235, yaw=2.07).put("tuna_can", 0.16, -0.069).put("bowl", 0, 0, on="tuna_can")
+    found = plan(goal, start)
+    assert [transfer.object for transfer in found.transfers] == ["bowl", "tuna_can"]
+    assert reached(goal, executed(start, found))
 
 
 def test_what_the_hand_cannot_reach_is_refused_with_object_and_reason():
@@ -219,7 +240,8 @@ def test_a_transfer_that_failed_gets_other_targets():
     first = plan(breakfast(), START)
     again = plan(breakfast(), START, avoid=(first.transfers[0].key,))
     same = next(t for t in again.transfers if t.key == first.transfers[0].key)
-    assert not any(np.allclose(same.T_base_targets[0], T) for T in first.transfers[0].T_base_targets)
+    failed = first.transfers[0].T_base_targets
+    assert not any(np.allclose(same.T_base_targets[0], T) for T in failed[: len(failed) // 2])
 
 
 SPOTS = [(-0.1, 0.3), (-0.1, -0.3), (0.05, 0.3), (0.05, -0.3), (-0.1, 0.0)]
@@ -298,6 +320,20 @@ def test_objects_that_rest_on_each_other_in_the_goal_are_refused():
     start = Layout().put("tea_box", 0, 0).put("sponge", 0, 0.3).graph()
     found = planner().on_task(Task(goal_name="goal", goal=goal, current=start), Recorded())
     assert found.reason == "in the goal tea_box, sponge rest on each other in a circle"
+
+
+def test_objects_that_stand_beside_each_other_in_a_circle_are_refused():
+    goal = Layout().put("tea_box", 0, 0).put("sponge", 0, 0.12).graph()
+    (beside,) = goal.virtual_objects
+    back = rerooted(goal, beside.child)
+    goal = msgspec.structs.replace(
+        goal,
+        virtual_objects=(beside, *back.virtual_objects),
+        assertions=tuple(dict.fromkeys((*goal.assertions, *back.assertions))),
+    )
+    start = Layout().put("tea_box", 0, 0).put("sponge", 0, 0.4).graph()
+    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start), Recorded())
+    assert found.reason.endswith("are beside each other in a circle"), found.reason
 
 
 def test_without_room_within_reach_the_task_is_refused():

@@ -212,6 +212,15 @@ def test_objects_stand_in_the_world_where_the_scene_says(drawn: dict[str, list[D
     assert "world/objects/cup/mesh" in paths_of(drawn["SceneGraph"], Mesh3D)
 
 
+def test_a_plan_shows_objects_where_it_puts_them(drawn: dict[str, list[Drawing]]) -> None:
+    (ghost,) = [item for item in drawn["Plan"] if isinstance(item, Lines3D)]
+    target = transfer("cup", "table", "tray").T_base_targets[0]
+    assert ghost.path == "world/plan/cup"
+    middle = np.mean(np.concatenate(ghost.strips)[:, :2], axis=0)
+    np.testing.assert_allclose(middle, target[:2, 3], atol=0.03)
+    assert ghost.path in paths_of(drawn["Outcome"], Clear), "it is there itself"
+
+
 def test_a_scene_graph_links_objects_and_regions() -> None:
     graph = scene_nodes("graph/scene", SCENE, CATALOGUE_DATA)
     assert isinstance(graph, Graph)

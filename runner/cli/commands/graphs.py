@@ -9,6 +9,7 @@ import json
 from typing import TYPE_CHECKING
 
 from runner.cli.commands import Commands, add, add_graph, add_recordings
+from runner.contract import Refused
 from runner.terminal import Terminal
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ def add_commands(commands: Commands) -> None:
     up = add(commands, "up", _up, "run a graph, record it, and exit as it ends")
     add_graph(up)
     up.add_argument("--seed", type=int, help="root of all random numbers (short for --set seed=N)")
+    armed = "the operator's word that what can move may: sets armed=true for every stage that the graph says it of"
+    up.add_argument("--arm", action="store_true", help=armed)
     where = up.add_mutually_exclusive_group()
     where.add_argument("--host", metavar="NAME", help="start the processes of this host of the graph only")
     where.add_argument("--here", action="store_true", help="start the processes of all hosts on this machine")
@@ -50,8 +53,8 @@ def _up(options: argparse.Namespace) -> int:
     if options.view:
         require_viewer()
     seed = [] if options.seed is None else [f"seed={options.seed}"]
-    options.settings = (*options.settings, *seed)
     document = read_document(options.graph)
+    options.settings = (*options.settings, *seed, *(_armed(document) if options.arm else ()))
     for setting in options.settings:
         document.set(setting)
     host = None if options.here else _other_host(options, document)
@@ -62,6 +65,16 @@ def _up(options: argparse.Namespace) -> int:
     end = _supervise(options, terminal) if host is None else _take_part(options, document, host, terminal)
     terminal.plain(end.reason)
     return end.code
+
+
+def _armed(document: Document) -> list[str]:
+    """Settings that give the operator's word to every stage that waits for it."""
+    stages = document.values.get("stages")
+    entries = stages.items() if isinstance(stages, dict) else ()
+    found = [name for name, entry in entries if isinstance(entry, dict) and "armed" in (entry.get("config") or ())]
+    if not found:
+        raise Refused(f"{document.label}: --arm: no stage has the setting 'armed'")
+    return [f"{name}.armed=true" for name in found]
 
 
 def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
@@ -108,8 +121,12 @@ def _take_part(options: argparse.Namespace, document: Document, host: str, termi
 
 def _check(options: argparse.Namespace) -> None:
     from runner.graph.graph import load_graph
+    from runner.graph.references import load_class
 
     graph = load_graph(options.graph, options.settings)
+    for key, reference in (("view", graph.view), ("story", graph.story), ("score", graph.score)):
+        if reference is not None:
+            load_class(reference, f"{options.graph}: {key}")
     commands = len(graph.commands())
     edges = sum(len(node.inputs) for node in graph.nodes.values()) - commands
     counts = (f"{len(graph.nodes)} stages", f"{len(graph.processes())} processes", f"{edges} edges")

@@ -55,7 +55,7 @@ def add_commands(commands: Commands) -> None:
     page.add_argument(
         "--address", default="127.0.0.1", help="where it is; beyond this machine RUNNER_PAGE_TOKEN must be set"
     )
-    page.add_argument("--port", type=int, default=0, help="any that is free by default")
+    page.add_argument("--port", type=_port, default=0, help="any that is free by default")
     _add_run(page)
 
     _add_run(add(commands, "down", _down, "end a graph in order and wait until it is gone"))
@@ -79,6 +79,12 @@ def _add_verbs(verbs: Commands) -> None:
 def _add_run(parser: argparse.ArgumentParser) -> None:
     text = "which run, where there are several; the beginning of its name will do"
     completed(parser.add_argument("--run", metavar="NAME", help=text), completion.run_names)
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be 0 to 65535")
+    return int(text)
 
 
 def _ps(options: argparse.Namespace) -> None:
@@ -139,21 +145,27 @@ def _call(options: argparse.Namespace) -> int | None:
     from runner.live.tables import commands_text, show_progress
     from runner.supervise.calls import CallRequest
 
+    fields = _fields(options.fields)
     with _reached(options) as live:
         if options.name is None:
             print(commands_text(live.commands(), options.stage))
             return None
         live.wait_until_ready(print)
-        request = CallRequest(options.stage, options.name, dict(map(_field, options.fields)))
+        request = CallRequest(options.stage, options.name, fields)
         id = live.call(request)
         return show_progress(id, options.stage, live.follow(id))
 
 
-def _field(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise Refused(f"{text}: expected field=value, for example name=breakfast")
-    return name, value
+def _fields(texts: list[str]) -> dict[str, str]:
+    fields: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise Refused(f"{text}: expected field=value, for example name=breakfast")
+        if name in fields:
+            raise Refused(f"{text}: {name} is given twice")
+        fields[name] = value
+    return fields
 
 
 def _restart(options: argparse.Namespace) -> None:

@@ -71,11 +71,12 @@ def _recover(options: argparse.Namespace) -> None:
 
 
 def _why(options: argparse.Namespace) -> None:
-    from runner.inspect.causes import tree
+    from runner.inspect.causes import Causes
     from runner.inspect.logs import newest_recording
     from runner.recording.recording import Recording
 
-    print(*tree(Recording(options.file or newest_recording(options.recordings)), options.id), sep="\n")
+    recording = Recording(options.file or newest_recording(options.recordings))
+    print(*Causes(recording).tree_of(options.id), sep="\n")
 
 
 def _latency(options: argparse.Namespace) -> None:

@@ -60,7 +60,7 @@ function form(page, {stage, name, text, fields}) {
     <h3>${stage} <b>${name}</b></h3><p class="quiet">${text}</p>
     ${fields.map((field) => html`<label>${field.name} ${input(field)}
       ${field.text ? html`<span class="hint">${field.text}</span>` : nothing}</label>`)}
-    <button ?disabled=${!page.connected}>${page.say("call")}<span class="unseen"> ${stage} ${name}</span></button>
+    <button ?disabled=${!page.ready}>${page.say("call")}<span class="unseen"> ${stage} ${name}</span></button>
     ${reason ? html`<p class="refused" role="alert">${reason}</p>` : nothing}
   </form>`;
 }

@@ -21,6 +21,7 @@ const page = {
   told: null, // by whoever tells the story of this graph
   run: null,
   calls: [],
+  calling: 0, // calls that nobody has taken yet
   commands: [],
   status: null,
   log: [],
@@ -29,6 +30,11 @@ const page = {
   solid: false, // whether the robot is shown in 3D
   marked: "", // the outline that is pointed at
   refused: {}, // why a command could not be called, by stage.command
+
+  /** Whether there is somebody to ask. */
+  get ready() {
+    return page.connected && page.run?.state !== "starting";
+  },
 
   /** The text of a key in the chosen language, its {words} filled in. */
   say(key, words = {}) {
@@ -39,13 +45,16 @@ const page = {
   async call(stage, command, args) {
     const name = `${stage}.${command}`;
     delete page.refused[name];
+    page.calling += 1;
     page.draw();
     try {
-      const answer = await fetch("call", {method: "POST", body: JSON.stringify({stage, command, arguments: args})});
+      const body = JSON.stringify({stage, command, arguments: args});
+      const answer = await fetch("call", {method: "POST", body, headers: {"accept-language": page.language}});
       if (!answer.ok) page.refused[name] = await answer.text();
     } catch {
       page.refused[name] = page.say("lost");
     }
+    page.calling -= 1;
     page.draw();
   },
 

@@ -16,7 +16,7 @@ export function button(page, action, {shortcut, about} = {}) {
   };
   return html`<form class="action ${kind}" @submit=${send}>
     ${action.ask ? field(action) : nothing}
-    <button class=${kind} ?disabled=${!action.now || !page.connected}
+    <button class=${kind} ?disabled=${!action.now || !page.ready}
       aria-keyshortcuts=${shortcut ?? nothing} aria-describedby=${about ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
       >${action.label}</button>
     ${reason ? html`<p class="refused" role="alert">${page.say("refused")} ${reason}</p>` : nothing}

@@ -92,10 +92,10 @@ export function statements(page, told) {
 
 function doing(page, told) {
   const {text, busy, step, steps, since_ns, expected_s} = told.doing;
-  const past = Date.now() / 1000 - since_ns / 1e9;
+  const past = Date.now() / 1000 - since_ns / 1e9, newest = page.calls.at(-1);
   return html`<section class="doing ${busy ? "busy" : ""}" aria-labelledby="now">
     <h2 id="now">${page.say("now")}</h2>
-    <p class="what" role="status">${text}</p>
+    <p class="what" role="status">${page.run?.state === "starting" ? page.say("starts") : text}</p>
     ${steps.length ? html`<progress max=${steps.length} value=${step - 1} aria-label=${page.say("progress")}></progress>
       <ol class="steps">${steps.map((one, k) => html`<li class=${k + 1 < step ? "past" : ""}
         aria-current=${k + 1 === step ? "step" : nothing}>${one}</li>`)}</ol>` : nothing}
@@ -104,8 +104,9 @@ function doing(page, told) {
       expected_s > past ? page.say("left", {time: lasted(expected_s - past)}) : ""].filter(Boolean).join(" · ")}</p>
     ${question(page, told.question)}
     ${notice(page, told.notice)}
-    ${page.calls.at(-1)?.refused
-      ? html`<p class="refused" role="alert">${page.say("refused")} ${page.calls.at(-1).refused}</p>` : nothing}
+    ${page.calling || (newest && !newest.done && !busy) ? html`<p class="quiet" role="status">${page.say("passed_on")}</p>` : nothing}
+    ${newest?.refused
+      ? html`<p class="refused" role="alert">${page.say("refused")} ${newest.refused}</p>` : nothing}
   </section>`;
 }
 
@@ -136,11 +137,18 @@ function cards(page, told) {
     ${told.cards_actions.map((action) => button(page, action))}</section>`;
 }
 
+/** To what the robot does now: there it goes on, for the keyboard too. */
+function upwards() {
+  const main = document.getElementById("main");
+  main.scrollIntoView({behavior: "smooth"});
+  main.focus({preventScroll: true});
+}
+
 function card(page, card) {
   return html`<li>
     ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
     <h3>${card.title}</h3><p>${card.text}</p>
-    <div @submit=${() => document.getElementById("main").scrollIntoView({behavior: "smooth"})}>
+    <div @submit=${upwards}>
       ${card.actions.map((action) => button(page, action))}</div>
     ${card.lines.length ? html`<details><summary>${card.lines_title}<span class="unseen"> ${card.title}</span></summary>
       <ul class="lines">${card.lines.map((line, k) => html`<li><span id="line-${card.key}-${k}">${line.text}</span>

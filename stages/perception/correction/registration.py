@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3, pose
+from stages.geometry.arrays import Floats, most_telling
+from stages.geometry.poses import small_motion
 from stages.perception.correction.body import RobotSurface
 from stages.perception.rendering.rasteriser import Float32s, View
 
@@ -85,10 +85,10 @@ class Registration:
                 weights = np.where(np.abs(error) < gate, weights * (1 - (error / gate) ** 2) ** 2, 0.0)
                 information += (J * weights[:, None]).T @ J
                 pull -= (J * (weights * error)[:, None]).sum(0)
-            step = np.asarray(np.linalg.solve(information, pull), float)
-            T_believed_true = T_believed_true @ pose(exp_so3(step[:3]), step[3:6])
-            factor *= 1.0 + step[6]
-            found = found + step
+            change = np.asarray(np.linalg.solve(information, pull), float)
+            T_believed_true = T_believed_true @ small_motion(change[:6])
+            factor *= 1.0 + change[6]
+            found = found + change
         return self._judged(sights, T_believed_true, factor, found)
 
     def _judged(self, sights: Sequence[Sight], T_believed_true: Floats, factor: float, found: Floats) -> Fit:
@@ -109,13 +109,7 @@ class Registration:
 
     def telling(self, postures: Sequence[Posture]) -> Iterator[int]:
         """Indices of postures, each the one that leaves least uncertainty after those before it (D-optimal)."""
-        gains = [self._information(posture) for posture in postures]
-        known, left = np.diag(self._prior**-2), list(range(len(postures)))
-        while left:
-            best = max(left, key=lambda k: np.linalg.slogdet(known + gains[k])[1])
-            known = known + gains[best]
-            left.remove(best)
-            yield best
+        return most_telling([self._information(posture) for posture in postures], np.diag(self._prior**-2))
 
     def _readings(self, sight: Sight, T: Floats, factor: float) -> tuple[Floats, Floats, Floats]:
         """How distances from the surface change with the seven numbers (N x 7), the distances (N) and weights (N)."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.messages.digest import GLIMPSE_STRIDE, Glimpse
-from stages.perception.detection.appearance import Bytes
+from stages.perception.detection.appearance import Bytes, Mask
 from stages.perception.detection.labels import Judge
 from stages.perception.detection.outline import HIDES
 from stages.perception.detection.propose import confidences
@@ -24,12 +24,14 @@ _OUTLINE = 1.5
 """How clear a silhouette's outline is taken to be: that of an object."""
 _SMALLEST = 60
 """Visible pixels below which nothing can be recognised."""
-_ODDS = 2.4
-_FIRST, _SECOND, _DEPTH, _BORDER = 0.55, 2.7, 12.9, -10.5
-EXPLAINED, FAINT = 0.8, 0.12
+_ODDS = 1.6
+_FIRST, _SECOND, _DEPTH, _BORDER, _PAINT = 0.5, 2.5, 11.4, -10.5, 5.7
+EXPLAINED, FAINT, ALIKE = 0.8, 0.12, 0.6
 """Log-odds that an object is there with this label: the odds of both judgements, the share of the readings that it
-covers which it explains, from this share on, and the share of its outline that does not show, from that share on.
-`python -m benchmarks.appraisal` fits it."""
+covers which it explains, from this share on, the share of its outline that does not show, from that share on, and how
+much the photograph looks as if it were there, from that likeness on. `python -m benchmarks.appraisal` fits it."""
+_MOST_ALIKE = 1.5
+"""Likeness beyond which an object could not look more as if it were there."""
 _CERTAIN = 3.0
 """Log-odds beyond which a judgement is as good as any: look-alikes are never out of the question."""
 _SUREST = 5.0
@@ -56,13 +58,19 @@ def second_confidences(judge: Judge, rgb: Bytes, regions: Sequence[Region | None
     return found
 
 
-def appraisal(first: Floats, second: Floats, explained: Floats, faint: Floats) -> Appraisal:
-    """Of confidences before and after the look, the shares of what objects cover that they explain, and those of their
-    outlines that do not show (NaN where that cannot be told); N each."""
-    outline = np.where(np.isnan(faint), 0.0, faint - FAINT)
-    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second) + _BORDER * outline
+def appraisal(first: Floats, second: Floats, explained: Floats, faint: Floats, alike: Floats) -> Appraisal:
+    """Of confidences before and after the look, the shares of what objects cover that they explain, those of their
+    outlines that do not show, and how much the photograph looks as if they were there (both NaN where that cannot be
+    told); N each."""
+    outline, paint = np.nan_to_num(faint - FAINT), np.nan_to_num(bounded_likeness(alike) - ALIKE)
+    appearance = _ODDS + _FIRST * log_odds(first) + _SECOND * log_odds(second) + _BORDER * outline + _PAINT * paint
     odds = appearance + _DEPTH * (np.clip(explained, 0, 1) - EXPLAINED)
     return Appraisal(1 / (1 + np.exp(-np.clip(odds, -_SUREST, _SUREST))), EXPLAINED - appearance / _DEPTH)
+
+
+def bounded_likeness(alike: Floats) -> Floats:
+    """Likeness to the photograph as far as it counts."""
+    return np.clip(alike, 0.0, _MOST_ALIKE)
 
 
 def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Floats) -> Region | None:
@@ -93,6 +101,14 @@ def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Fl
         top=float(np.percentile(height[whole], 98)),
         whole=whole,
     )
+
+
+def visible_mask(region: Region, view: View) -> Mask:
+    """Where in the image a silhouette is seen, H x W."""
+    shown = np.zeros((view.height, view.width), bool)
+    x0, y0, x1, y1 = region.box.astype(int)
+    shown[y0:y1, x0:x1] = region.mask
+    return shown
 
 
 def visible_box(region: Region) -> Floats:

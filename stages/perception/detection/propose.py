@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
+from stages.perception.detection.alignment import aligned
 from stages.perception.detection.appearance import Bytes
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.labels import Judge
@@ -55,8 +56,9 @@ class Proposer:
         gravity in the camera frame where it is known."""
         step = max(1, round(rgb.shape[1] / _WIDTH))
         view = View.of(K, rgb.shape[1], rgb.shape[0]).sampled(0, 0, rgb.shape[1], rgb.shape[0], step)
-        small = np.asarray(cv2.resize(rgb, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
         sparse = np.ascontiguousarray(depth[::step, ::step])
+        small = np.asarray(cv2.resize(rgb, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
+        small = aligned(small, sparse)
         found = regions(small, sparse, view, rng, up=up, sizes=self._judge.sizes, most=_REGIONS)
         if not found:
             return Proposals(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros((0, len(self.labels))))

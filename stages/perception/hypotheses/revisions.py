@@ -32,7 +32,7 @@ class Revision:
 
 
 def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
-    """Every revision of the best scene, the likelier kinds first.
+    """Every revision of the best scene but other labels, the likelier kinds first.
 
     An object that others hide wholly is left out; an offer comes in; another object of the same kind does, for two of
     which one hides most of the other may share a box; an offer comes in, and an object in its way is looked for again
@@ -40,13 +40,11 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
     last round revised, that was in vain.
     """
     everything = tuple(range(len(best.objects)))
-    chosen = {_index(item, offers): i for i, item in enumerate(best.objects)}
+    chosen = _chosen(best, offers)
     without = {k: tuple(j for j in everything if j != i) for k, i in chosen.items()}
     unseen = [k for k, i in chosen.items() if best.objects[i].visible < _UNSEEN]
-    by_share = sorted(range(len(offers)), key=lambda k: -best.unexplained[k])
-    tried = [k for k, share in enumerate(before) if share > _OPEN and abs(best.unexplained[k] - share) < _EQUAL]
-    left_open = [k for k in by_share if best.unexplained[k] > _OPEN and k not in tried]
-    missing = [k for k in left_open if k not in chosen]
+    left_open = _left_open(best, before)
+    missing = [k for k in left_open if k not in chosen and not offers[k].instead]
     doubtful = [k for k in left_open if k in chosen]
     met = [(k, new) for k, new in product(doubtful, missing) if _meet(offers[k], offers[new])]
     return [
@@ -59,15 +57,43 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
     ]
 
 
+def relabelled(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
+    """Revisions in which what a box leaves unexplained is an object by another label, in the place of the one that came
+    from that box, if there is any; as :func:`revisions`."""
+    chosen = _chosen(best, offers)
+    instead = [k for k in _left_open(best, before) if offers[k].instead and k not in chosen]
+    taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
+    return [
+        Revision(tuple(i for i in range(len(best.objects)) if i not in gone), (k,))
+        for k, gone in zip(instead, taken, strict=True)
+    ]
+
+
 def is_better(log_weight: float, known: float) -> bool:
     """Whether a scene saves enough of what the best one before costs."""
     return log_weight > (1 - _GAIN) * known
+
+
+def _chosen(best: Posterior, offers: Sequence[Offer]) -> dict[int, int]:
+    """The objects of the best scene by their offers."""
+    return {_index(item, offers): i for i, item in enumerate(best.objects)}
+
+
+def _left_open(best: Posterior, before: Sequence[float]) -> list[int]:
+    """The offers in whose boxes something is unexplained, most first, but those that were tried in vain."""
+    by_share = sorted(range(len(best.unexplained)), key=lambda k: -best.unexplained[k])
+    tried = [k for k, share in enumerate(before) if share > _OPEN and abs(best.unexplained[k] - share) < _EQUAL]
+    return [k for k in by_share if best.unexplained[k] > _OPEN and k not in tried]
 
 
 def _index(item: ObjectPose, offers: Sequence[Offer]) -> int:
     """The offer that an object comes from."""
     return next(k for k, offer in enumerate(offers)
                 if offer.candidate.label == item.label and np.array_equal(offer.candidate.box, item.box))  # fmt: skip
+
+
+def _same_box(one: Offer, other: Offer) -> bool:
+    return np.array_equal(one.candidate.box, other.candidate.box)
 
 
 def _meet(one: Offer, other: Offer) -> bool:

@@ -8,6 +8,7 @@ depth within a few pixels at best.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,8 +63,36 @@ def log_odds(
     ``rgb`` is H x W x 3 (sRGB), ``shown`` H x W: where the object would be seen at any pose, nothing in front of it;
     ``poses`` are P x 3 x 4 rows of T_camera_object.
     """
-    if len(poses) < 2 or shown.sum() < _LEAST:
+    if len(poses) < 2:
         return np.zeros(len(poses))
+    found = _compared(rgb, view, shown, poses, paint=paint, settings=settings)
+    return np.zeros(len(poses)) if found is None else settings.nats * found.told_apart * found.likeness
+
+
+def likeness(
+    rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, *, paint: Paint, settings: ColourSettings
+) -> float:
+    """How much the photograph looks as if the object were there, at the best of poses that differ in what is painted.
+
+    The mean cosine of features, summed over the three layers: 3 for what is equal, about 0 for what has nothing in
+    common; NaN where it cannot be said. Otherwise as :func:`log_odds`.
+    """
+    found = _compared(rgb, view, shown, poses, paint=paint, settings=settings)
+    return np.nan if found is None else float(found.likeness.max())
+
+
+class _Compared(NamedTuple):
+    likeness: Floats
+    """Of the photograph to each drawn pose, P."""
+    told_apart: float
+    """How much the drawn poses differ in what is painted, 0 to 1."""
+
+
+def _compared(
+    rgb: NDArray[np.uint8], view: View, shown: Mask, poses: Floats, *, paint: Paint, settings: ColourSettings
+) -> _Compared | None:
+    if shown.sum() < _LEAST:
+        return None
     reach = settings.reach * view.fx
     crop = _Crop.around(shown, view, int(reach) + _MARGIN)
     drawn, covers = zip(*(paint.drawn(T, crop.view) for T in poses), strict=True)
@@ -71,14 +100,14 @@ def log_odds(
     any_pose: Mask = np.logical_or.reduce(covered)
     common = _shrunk(np.logical_and.reduce(covered), crop.scale)
     if common.sum() < _LEAST * crop.scale**2:
-        return np.zeros(len(poses))
+        return None
     photograph = crop.cut(rgb.astype(np.float32))
     around = (cv2.dilate(any_pose.astype(np.uint8), _square(_RING * crop.scale)) > 0) & ~any_pose
     empty = np.where(any_pose[..., None], np.median(photograph[around], 0), photograph)
     pasted = np.where(covered[..., None], _lit(np.stack(drawn), photograph, common), empty)
     inner = _shrunk(any_pose, crop.scale)
-    worth = settings.nats * _told_apart(pasted[:, inner], settings.alike)
-    return worth * _likeness(photograph, pasted, inner, reach * crop.scale)
+    told_apart = _told_apart(pasted[:, inner], settings.alike)
+    return _Compared(_likeness(photograph, pasted, inner, reach * crop.scale), told_apart)
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,8 @@ _UPRIGHT = 0.9
 """Cosine of the angle to the vertical below which a turn would lay an upright object down."""
 _ON_ITS_HEAD = 2.0
 """Nats by which it is less likely that an object stands upside down: where little of it shows, nothing else tells."""
+_TIE = 0.01
+"""Nats of difference that are rounding: of turns that look the same the object keeps the one that it has."""
 _FACING = np.deg2rad(15.0)
 """Turns within this show the same side."""
 
@@ -268,7 +270,7 @@ class _Joint:
         faced = _turned(poses, turns)
         ups = faced[:, :, :3, 2] @ self._scene.T_camera_table[:3, 2]
         odds = odds[:, None] + self._colours(i, place, faced, rgb) - _ON_ITS_HEAD * (ups < -_UPRIGHT)
-        flip, turn = divmod(int(np.argmax(odds)), len(turns))
+        flip, turn = divmod(int(np.argmax(odds > odds.max() - _TIE)), len(turns))
         shape_moved = not np.array_equal(poses[flip], self._poses[i])
         self._move(i, faced[flip, turn])
         self._considered[i] = _considered(poses, odds.max(1), flip)

@@ -215,14 +215,20 @@ def _side_grasps(item: Section, mesh: Mesh) -> Iterator[Grasp]:
 
 
 def _rim_grasps(item: Section, mesh: Mesh) -> Iterator[Grasp]:
-    """From above on the wall of a vessel: one finger inside, one outside, at ``radius`` from the z axis."""
-    item.only("azimuths", "radius", "depth", "at", "width")
+    """Along the wall of a vessel, from above: one finger inside, one outside; the brim is ``radius`` from the z axis.
+
+    ``lean``: degrees by which the wall widens upwards.
+    """
+    item.only("azimuths", "radius", "depth", "lean", "at", "width")
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    at = np.array([*item.numbers("at", 2, (low + high)[:2] / 2), high[2] - item.number("depth", FINGER_DEPTH, low=0)])
+    at = np.array([*item.numbers("at", 2, (low + high)[:2] / 2), high[2]])
+    lean, depth = np.deg2rad(item.number("lean", 0.0)), item.number("depth", FINGER_DEPTH, low=0)
     item.number("width", low=0)  # The mesh's own width would span to the opposite wall.
     for azimuth in _angles(item, "azimuths"):
-        R = _frame(approach=np.array([0, 0, -1.0]), closing=_heading(azimuth))
-        T = transform(R, at + item.number("radius", low=0) * _heading(azimuth))
+        outward = _heading(azimuth)
+        approach = -np.sin(lean) * outward - np.cos(lean) * np.array([0.0, 0.0, 1.0])
+        brim = at + item.number("radius", low=0) * outward
+        T = transform(_frame(approach=approach, closing=outward), brim + depth * approach)
         yield _grasp("top", f"rim {azimuth:g}", T, item, mesh)
 
 

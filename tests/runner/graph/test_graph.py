@@ -44,7 +44,7 @@ def test_a_good_graph_loads(tmp_path: Path):
         ("seed: 7", "seed: !wheat 7", ":2: not YAML: .*!wheat"),
         ("seed: 7", "seed: &self {seed: *self}", ": not YAML: a mapping contains itself"),
         ("seed: 7", "name: again", ":2: name: this key appears twice"),
-        ("seed: 7", "seed: many", ":2: seed: Expected `int`, got `str`"),
+        ("seed: 7", "seed: many", ":2: seed: Expected `int`, got 'many'"),
         ("toys:Sink", "toys:Snk", ":19: stages.sink.stage: no class 'Snk' in .*; did you mean 'Sink'"),
         ("toys:Sink", "toyz:Sink", ":19: stages.sink.stage: no module 'tests.runner.common.toyz'; did"),
         ("toys:Sink", "toys:Number", ":19: stages.sink.stage: .* is not"),
@@ -85,7 +85,7 @@ def test_a_good_graph_loads(tmp_path: Path):
         ),
         ("seed: 7", "tolerances: tests.runner.weather:MIGRATIONS", ":2: tolerances: .*; valid: Type.field"),
         ("seed: 7", "tolerances: tests.runnr.toys:TABLE", ":2: tolerances: no module 'tests.runnr.toys'"),
-        ("seed: 7", "numerical: numpy", ":2: numerical: Expected `array`, got `str`"),
+        ("seed: 7", "numerical: numpy", ":2: numerical: Expected `array`, got 'numpy'"),
         (
             "answers: worker.answer",
             "answers: {from: worker.answer, policy: latest}",
@@ -151,10 +151,10 @@ def test_who_answers_no_parts_may_take_the_latest(tmp_path: Path):
     [
         ("sink.pth=x", "--set sink.pth: unknown key 'pth'; did you mean 'path'"),
         ("snk.path=x", "--set snk.path: no stage 'snk'; did you mean 'sink'"),
-        ("worker.seconds=soon", "--set worker.seconds: Expected `float`, got `str`"),
+        ("worker.seconds=soon", "--set worker.seconds: Expected `float`, got 'soon'"),
         ("splitter.replicas=2", "--set splitter.replicas: .* takes no Part"),
         ("seed", "--set seed: expected key=value"),
-        ("seed=2026-13-45", "--set seed: Expected `int`, got `str`"),
+        ("seed=2026-13-45", "--set seed: Expected `int`, got '2026-13-45'"),
         ("splitter.parts=${worker.secnds}", "--set splitter.parts: no setting 'worker.secnds'"),
     ],
 )
@@ -195,7 +195,7 @@ def test_commands_that_would_share_a_port_are_refused(tmp_path: Path):
     ],
 )
 def test_a_name_ends_where_its_line_does(tmp_path: Path, old: str, new: str, place: str):
-    with pytest.raises(Refused, match=f"{place}: Expected `str` matching regex"):
+    with pytest.raises(Refused, match=f"{place}: .* does not fit"):
         load(tmp_path, OUT, old=old, new=new)
 
 

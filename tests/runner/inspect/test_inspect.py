@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from runner.cli.main import main
 from runner.contract import Refused
 from runner.graph.graph import load_graph
-from runner.inspect.causes import Causes, tree
+from runner.inspect.causes import Causes
 from runner.inspect.info import Durations, StageTimes
 from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
@@ -60,21 +60,21 @@ def test_the_newest_recording_is_the_default(toys: Path, capsys: pytest.CaptureF
 
 
 def test_an_unknown_message_is_refused_with_the_nearest(toys: Path):
-    with pytest.raises(Refused, match=r"no message 'gatherer\.totl#1'.*gatherer\.total#1"):
-        tree(Recording(toys), "gatherer.totl#1")
+    with pytest.raises(Refused, match=r"no message 'gatherer\.totl#1'; did you mean 'gatherer\.total'"):
+        list(Causes(Recording(toys)).tree_of("gatherer.totl#1"))
 
 
 def test_a_cause_that_is_missing_is_named(tmp_path: Path):
     lost = "worker.answer#5"
     path, _ = record_toys(tmp_path, keep=lambda record: None if getattr(record, "id", "") == lost else record)
-    lines = tree(Recording(path), "gatherer.total#1")
+    lines = list(Causes(Recording(path)).tree_of("gatherer.total#1"))
     assert any(f"{lost}  MISSING from the recording, travelled" in line for line in lines)
     assert any("splitter.piece#5" in line for line in lines)
 
 
 def test_without_a_journal_the_causes_in_the_header_are_shown(tmp_path: Path):
     path, _ = record_toys(tmp_path, keep=lambda record: None if isinstance(record, Step) else record)
-    lines = tree(Recording(path), "splitter.piece#4")
+    lines = list(Causes(Recording(path)).tree_of("splitter.piece#4"))
     assert lines == ["splitter.piece#4  Piece", "└─ counter.number#1  Number, the lineage starts here"]
 
 
@@ -154,11 +154,11 @@ def test_durations_in_little_memory_are_as_good_as_exact(times: list[int]):
 
 def test_the_table_of_times_counts_steps_and_not_how_processes_end():
     times = StageTimes()
-    for number, outcome in enumerate(("done", "failed", "ended")):
+    for number, outcome in enumerate(("done", "failed", "stopped", "ended")):  # stopped: by the end of the graph
         times.note(Step("worker", 1, 0, number, "on_piece", (), (), 0, 2 * MS, 3 * MS, (number + 1) * MS, outcome))
     times.note(Step("supervisor", 0, 0, 0, "", (), ("supervisor.restarted#0",), 0, 0, 0, 0))
     _, row = times.lines()
-    cells = ["1", "2", "1.50 ms", "2.00 ms", "3.00 ms", "3.00 ms", "2.00 ms", "1"]
+    cells = ["1", "3", "2.00 ms", "3.00 ms", "6.00 ms", "3.00 ms", "2.00 ms", "1"]
     assert row.split("  ")[0] == "worker"
     assert [cell.strip() for cell in row.split("  ")[1:] if cell.strip()] == cells
 

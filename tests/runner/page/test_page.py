@@ -142,7 +142,7 @@ def test_what_cannot_be_called_is_refused_in_words(lamp: Lamp) -> None:
 def test_recordings_are_listed_and_can_be_downloaded(lamp: Lamp) -> None:
     path = urlsplit(lamp.url).path
     (run,) = json.loads(asked(lamp.url, f"{path}runs")[1])
-    assert run["running"] and run["name"].startswith("lamp-")
+    assert run["running"] and run["name"].startswith("lamp-") and run["graph"] == "lamp"
     status, _ = asked(lamp.url, f"{path}runs/{run['name']}.mcap")
     assert status == 200
 
@@ -286,7 +286,10 @@ def test_all_of_it_is_there_in_german(lamp: Lamp, chromium: Browser) -> None:
         expect(page.get_by_text("-mal geblinkt")).to_be_visible()
         expect(page.get_by_role("link", name="Technik")).to_be_visible()
         assert page.evaluate("document.documentElement.lang") == "de"
+        page.get_by_role("button", name="Dizzy").click()
+        expect(page.get_by_text("Das geht nicht: times=10: macht schwindlig")).to_be_visible()
         page.get_by_label("Sprache").select_option("en")
+        expect(page.get_by_text("That does not work: times=10: makes people dizzy")).to_be_visible()
         expect(page.get_by_text("has blinked")).to_be_visible()
         page.reload()
         expect(page.get_by_role("link", name="Engineer")).to_be_visible()

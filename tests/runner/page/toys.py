@@ -80,6 +80,9 @@ class LampStory:
     def recall(self) -> None:
         self._blinked = 100
 
+    def say(self, refusal: str, language: s.Language) -> str:
+        return refusal if language == "en" else refusal.replace("makes people dizzy", "macht schwindlig")
+
     def tell(self, language: s.Language) -> s.Told:
         text = {"en": "has blinked {} times", "de": "hat {}-mal geblinkt"}[language].format(self._blinked)
         x, y = self._place

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runner.contract import Message, Spec
+from runner.contract import EXIT_REFUSED, Message, Spec
 from runner.message.codec import Envelope, Journal, LogLine, Step, encode, envelope, pack, unpack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.process.children import last_lines, spawn
-from runner.process.recorder import EXIT_INCOMPLETE, EXIT_REFUSED
+from runner.process.recorder import EXIT_INCOMPLETE
 from runner.recording.recording import Recording
 from runner.recording.writer import Manifest, topic
 from runner.transport.bus import Bus

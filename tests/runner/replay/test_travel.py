@@ -110,7 +110,7 @@ def test_without_messages_there_is_none_to_stop_at(tmp_path: Path, typed: Typed,
     ("arguments", "error"),
     [
         (["--until", "gatherer.total#9"], "the nearest: gatherer.total#2, gatherer.total#3, gatherer.total#4"),
-        (["--until", "gatherer.totl#1"], "has no message of 'gatherer.totl'; did you mean 'gatherer.total'"),
+        (["--until", "gatherer.totl#1"], "no message 'gatherer.totl#1'; did you mean 'gatherer.total'"),
         (["--break", "gatherer.totl.last"], "gatherer has no output 'totl'; did you mean 'total'? valid: total"),
         (["--break", "gatherer.total.lst"], "Total has no field 'lst'; did you mean 'last'? valid: last, samples"),
         (["--break", "gatherer.total.last >"], "is no expression of Python: invalid syntax"),

@@ -20,6 +20,13 @@ def test_the_domain_has_the_papers_predicates():
         assert f"({predicate}" in DOMAIN
 
 
+def test_every_type_is_declared_as_strict_parsers_want_it():
+    assert "(:requirements :adl :typing)" in DOMAIN
+    plain = re.sub(";.*", "", DOMAIN)
+    declared = set(re.split(r"[\s-]+", re.search(r"\(:types([^)]*)\)", plain)[1]))  # pyright: ignore[reportOptionalSubscript]
+    assert set(re.findall(r"\?\w+ - (\w+)", plain)) <= declared
+
+
 @pytest.mark.parametrize(
     ("name", "expected"), [("Cup", "cup"), ("003_cracker box", "o_003_cracker_box"), ("tea-box", "tea-box")]
 )

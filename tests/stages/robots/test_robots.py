@@ -10,6 +10,9 @@ import trimesh.creation
 import stages.robots
 from runner.contract import Refused
 from stages.devices.check_robot import report
+from stages.geometry.camera import project
+from stages.geometry.poses import inverse
+from stages.planning.collision import CollisionWorld
 from stages.robots import Robot, read_robot
 
 HERE = Path(__file__).parent
@@ -35,6 +38,19 @@ def pixels(robot: Robot, points: np.ndarray) -> np.ndarray:
 def test_the_camera_sees_where_the_robot_places(robot: Robot) -> None:
     corners = [[x, 0.95 * y, robot.table.height] for x in robot.x for y in robot.y]
     assert (np.abs(pixels(robot, np.array(corners))) < np.array(robot.camera.size) / 2).all()
+
+
+def test_the_camera_sees_it_from_every_view_too(robot: Robot) -> None:
+    world, corners = (
+        CollisionWorld(robot, robot.table, {}),
+        [[x, y, robot.table.height] for x in robot.x for y in robot.y],
+    )
+    for q in robot.views:
+        assert world.is_free(q)
+        posture = robot.posture | dict(zip(robot.joints, q.tolist(), strict=True))
+        T_camera_base = inverse(robot.camera_pose(tuple(posture), np.array(list(posture.values()))))
+        seen = project(np.array(corners) @ T_camera_base[:3, :3].T + T_camera_base[:3, 3], robot.camera.K)
+        assert ((seen > 0) & (seen < robot.camera.size)).all()
 
 
 def test_the_arm_at_home_is_outside_the_cameras_image(robot: Robot) -> None:
@@ -90,6 +106,11 @@ def test_the_torso_carries_the_camera() -> None:
             r"gripper: the model has no actuator",
         ),
         ('meshdir="stls/fetch"', 'meshdir="stl"', r"model: MuJoCo cannot build it: .*stl/"),
+        (
+            "still:",
+            "views: [{torso_joint: 0.2}]\nstill:",
+            r"views\[0\]\.torso_joint: unknown key; valid are torso_lift",
+        ),
         ("touching:", "touch:", r"touch: unknown key; valid are model, remove"),
     ],
 )
@@ -98,6 +119,15 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path
     file.write_text((FOLDER / "fetch.yaml").read_text().replace(old, new, 1))
     with pytest.raises(Refused, match=message):
         read_robot(file)
+
+
+def test_a_camera_on_a_head_looks_from_where_the_torso_has_it(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(f"like: {FOLDER}/fetch.yaml\nviews:\n  - {{torso_lift_joint: 0.2}}\n")
+    robot = read_robot(file)
+    (view,) = robot.views
+    assert view[0] == 0.2 and np.array_equal(view[1:], robot.home[1:])
+    assert CollisionWorld(robot, robot.table, {}).is_free(view)
 
 
 def test_a_description_may_be_like_another(tmp_path: Path) -> None:

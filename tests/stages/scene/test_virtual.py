@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from stages.messages import SceneGraph
 from stages.scene.stance import yawed
-from stages.scene.virtual import satisfied
+from stages.scene.virtual import rerooted, satisfied
 from tests.stages.layouts import Layout, asserted, breakfast, catalogue
 
 
@@ -41,6 +41,18 @@ def test_a_row_makes_a_chain_and_no_cycle():
     children = [child for _, child in sorted(pairs(layout.graph()))]
     assert len(children) == 3
     assert len(set(children)) == 3
+
+
+def test_a_chain_can_be_told_from_its_other_end():
+    row = Layout()
+    for k, name in enumerate(["cereal_box", "sugar_box", "tea_box"]):
+        row.put(name, 0.09 * k, 0.0, yaw=0.1 * k)
+    goal = row.graph()
+    (end,) = {child for _, child in pairs(goal)} - {parent for parent, _ in pairs(goal)}
+    told = rerooted(goal, end)
+    assert pairs(told) == {(child, parent) for parent, child in pairs(goal)}
+    assert violated(told, goal) == set()
+    assert len(told.assertions) == len(goal.assertions)
 
 
 def test_what_cannot_be_moved_is_the_root():

@@ -10,6 +10,30 @@ from stages.story.words import words_of
 SAID = {
     "stopped, as asked": "angehalten, wie gewünscht",
     "stopped, as asked; in the hand: tea_box": "angehalten, wie gewünscht; in der Hand ist noch die Teeschachtel",
+    "interactive-20261122-205043: no answer to 'call' within 10 s": "das Programm des Roboters antwortet nicht",
+    "question=1: nothing is asked now": "diese Frage ist schon beantwortet",
+    "busy: waits for the person's arrangement; ask again after the verdict": (
+        "der Roboter ist beschäftigt; warten Sie, bis er fertig ist, oder halten Sie ihn an"
+    ),
+    "name='lunch': no such goal in /somewhere; valid: none, teach one first": "keine Szene ist als „lunch“ gemerkt",
+    "to='a b': must consist of letters, digits, - and _ only": (
+        "„a b“ geht nicht als Name: nur Buchstaben, Ziffern, - und _"
+    ),
+    "as asked on the way to show 2": "angehalten, wie gewünscht",
+    "stopped, the way back is barred: 31 N at the hand on the way to go home; in the hand: cup": (
+        "der Arm bleibt, wo er ist, denn der Weg zurück ist versperrt: der Arm ist an etwas gestoßen; "
+        "in der Hand ist noch die Tasse"
+    ),
+    "slip: the fingers are 3 mm apart on the way to lift tea_box; no other way: no room to put tray aside": (
+        "das Ding ist aus der Hand gerutscht; es gibt keinen anderen Weg: es ist kein Platz, um das Tablett "
+        "beiseitezustellen"
+    ),
+    "not seen: cup; every other relation of the goal holds; knocked over: mug": (
+        "nicht zu sehen: die Tasse; alles andere ist am Platz; umgefallen: der Becher"
+    ),
+    "unknown: nothing was felt below cup where it was let go of": (
+        "unter der Tasse war beim Loslassen nichts zu spüren"
+    ),
     "2 of 6 objects seen (3 looks at scene 'goal')": "nur 2 von 6 Dingen waren zu sehen, nach 3-mal Hinsehen",
     "not seen: cup, tea_box": "nicht zu sehen: die Tasse und die Teeschachtel",
     "not seen: what carries soup_can (1 looks at scene 'start')": (
@@ -48,7 +72,7 @@ def test_what_stages_say_is_said_in_german(reason: str) -> None:
 @pytest.mark.parametrize("reason", SAID)
 def test_no_names_of_the_catalogue_are_left(reason: str) -> None:
     for language in ("en", "de"):
-        assert "_" not in told(reason, words_of(language))
+        assert "_" not in told(reason, words_of(language)).replace("- und _", "").replace("- and _", "")
 
 
 def test_what_is_not_known_stays_as_it_was_said() -> None:
@@ -61,4 +85,4 @@ def test_every_reason_has_its_words(language: str) -> None:
     for key in REASONS:
         parts = dict.fromkeys(("item", "other", "place"), texts.noun("cup"))
         names = dict.fromkeys(("names", "fixed"), texts.nouns(["cup", "tray"]))
-        assert texts.part(f"because_{key}", **parts, **names, number="3", of="6")
+        assert texts.part(f"because_{key}", **parts, **names, number="3", of="6", text="lunch")

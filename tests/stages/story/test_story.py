@@ -39,8 +39,8 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.correction import OWN_ARM
-from stages.messages.scene import Doubt, Stance, UnknownRegion
+from stages.messages.correction import CAMERAS_WAY, OWN_ARM
+from stages.messages.scene import Doubt, SceneObject, Stance, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.goals import GoalFolder, unpacked, without
@@ -343,12 +343,19 @@ def test_a_command_may_be_recorded_before_or_after_what_it_causes(command_first:
     assert listener.doing == "Looks at what there is to do for “tea”"
 
 
-def test_the_arm_that_shows_itself_may_be_stopped() -> None:
+@pytest.mark.parametrize(
+    ("shown", "doing"),
+    [
+        (f"{OWN_ARM}, posture 1 of 4", "Shows its arm to the camera"),
+        (CAMERAS_WAY, "Takes its camera elsewhere"),
+    ],
+)
+def test_an_arm_that_moves_for_a_look_may_be_stopped(shown: str, doing: str) -> None:
     listener = Listener(brakes=True)
     listener.called(Look())
-    shown, look = f"{OWN_ARM}, posture 1 of 4", LookRequest(purpose="look")
+    look = LookRequest(purpose="look")
     listener.hear(LookRequest(purpose=shown), msgspec.structs.replace(frame(), name=shown))
-    assert listener.doing == "Shows its arm to the camera"
+    assert listener.doing == doing
     assert ("executor", "stop") in {(action.stage, action.command) for action in listener.told().actions}
     listener.story.hear(Heard(look, "corrector.look_request#1", ("demonstrator.look_request#0",), 6))
     listener.hear(frame())
@@ -431,7 +438,7 @@ def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
     for number, doubt in enumerate(doubts, 1):
         listener.hear(Question(number=number, doubt=doubt))
         asked = listener.told(language).question
-        assert asked is not None and asked.about == (doubt.object or "unknown_0")
+        assert asked is not None and asked.about == {"unknown": "unknown_0", "which": ""}.get(doubt.kind, doubt.object)
         texts.add(asked.text)
         assert [one.arguments for one in asked.answers] == [
             {"question": str(number), "choice": choice} for choice in doubt.choices
@@ -442,6 +449,27 @@ def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
         listener.hear(Answer(question=number, choice="again"))
         assert listener.told().question is None
     assert len(texts) == len(doubts)
+
+
+def test_who_is_meant_has_the_name_in_the_picture_of_the_plan() -> None:
+    left, right = (T_CAMERA_CUP + translation(x, 0, 0) - np.eye(4) for x in (-0.2, 0.2))
+    (item,) = estimate().objects
+    cups = tuple(
+        msgspec.structs.replace(item, name=name, T_camera_object=T) for name, T in (("cup", left), ("cup_2", right))
+    )
+    named = tuple(SceneObject(name=name, label="cup", T_base_object=T) for name, T in (("cup", right), ("cup_2", left)))
+    listener = Listener()
+    listener.called(Restore(name="tea", ask=True))
+    listener.hear(frame(), msgspec.structs.replace(estimate(), objects=cups, T_base_camera=np.eye(4)), START)
+    doubt = Doubt(kind="which", object="cup", choices=("cup", "cup_2", "again"))
+    listener.hear(Question(number=1, doubt=doubt), Answer(question=1, choice="cup_2"))
+    current = msgspec.structs.replace(START, objects=named, T_base_camera=np.eye(4))
+    listener.hear(Task(goal_name="tea", goal=GOAL, current=current))
+    listener.hear(plan(msgspec.structs.replace(STEP, T_base_targets=left[None])))
+    view = listener.told().view
+    assert view is not None
+    assert {one.name: one.points[0][0] > 320 for one in view.outlines} == {"cup": True, "cup_2": False}
+    assert view.arrows[0].start[0] > 320
 
 
 @pytest.mark.parametrize("brakes", [True, False])

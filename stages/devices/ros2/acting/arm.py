@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from stages.devices.ros2.acting.efforts import Efforts, Felt
+from stages.devices.efforts import Efforts, Felt
 from stages.devices.ros2.acting.joints import JointStates
-from stages.devices.ros2.acting.path import Path, Progress
+from stages.devices.ros2.acting.path import Path, Progress, duration
 from stages.devices.ros2.node import Node
 from stages.devices.ros2.services import CANCEL, STATUSES, ActionClient, Goal, Unanswered
 from stages.devices.ros2.settings import Care, Controllers, Link
+from stages.devices.ros2.transforms import stamp_ns
 from stages.devices.ros2.wire import LATCHED
 from stages.geometry.arrays import Floats
 from stages.messages import RobotCommand, Ros2Message
@@ -58,7 +59,7 @@ class RemoteArm:
         self._names = [controllers.joints.get(name, name) for name in robot.joints]
         finger = robot.gripper.fingers[0]
         self._finger = controllers.gripper_joint or controllers.joints.get(finger, finger)
-        self._efforts = Efforts(robot) if controllers.efforts else None
+        self._efforts = Efforts(robot, robot.joints, balanced=False) if controllers.efforts else None
         self.said: deque[str] = deque(maxlen=100)
         """What could not be read."""
         self.sent: list[Ros2Message] = []
@@ -70,6 +71,8 @@ class RemoteArm:
         self._gripper_type = f"control_msgs/action/{controllers.gripper_type}"
         self._gripper = ActionClient(self._node, controllers.gripper, self._gripper_type)
         self._ghosts = self._node.publisher("~/display_planned_path", DISPLAY, LATCHED)
+        self._shown: list[Any] = []
+        """Motions that were shown as ghosts since the encoders were read."""
         self._asked = False
         self._stands = False
         """Nothing that is not known of can be moving: the newest command has ended well."""
@@ -91,6 +94,7 @@ class RemoteArm:
         ``id`` gives goals their 16 bytes. Nothing is sent while it is not known where every joint is.
         """
         self._asked, self.error, self.force, self.stopped, self.reason = False, 0.0, 0.0, "", ""
+        self._shown.clear()
         unknown, self._stands = not self._stands, False
         try:
             yield from self._know()
@@ -105,16 +109,17 @@ class RemoteArm:
             self.stopped, self.reason = broken.stopped, str(broken)
 
     def show(self, command: RobotCommand) -> None:
-        """Publishes a motion as a ghost, for who looks on; nothing moves."""
+        """Publishes a motion as a ghost, after those shown before, for who looks on; nothing moves."""
         points = [
-            {"positions": q, "time_from_start": {"sec": int(t), "nanosec": int(t % 1 * 1e9)}}
+            {"positions": q, "time_from_start": duration(t)}
             for t, q in zip(command.times, command.positions, strict=True)
         ]
         path = Path.trajectory(self._types, self._names, points)
+        self._shown.append(self._types.new("moveit_msgs/msg/RobotTrajectory", joint_trajectory=path))
         posture = {"name": self._names, "position": self._joints.positions(self._names)}
         ghost = self._types.new(
             DISPLAY,
-            trajectory=[self._types.new("moveit_msgs/msg/RobotTrajectory", joint_trajectory=path)],
+            trajectory=self._shown,
             trajectory_start={"joint_state": posture},
         )
         self._ghosts.put(ghost)
@@ -319,9 +324,7 @@ class _Watch:
             raise _Broken("fault", f"the controller stands {where} for {self._stuck:g} s and says nothing")
         if self._felt is None:
             return error, 0.0
-        k, stamp = progress.index, message.header.stamp
-        seconds = stamp.sec + stamp.nanosec / 1e9
-        measured = message.effort[order]
+        k, seconds, measured = progress.index, stamp_ns(message.header) / 1e9, message.effort[order]
         return error, self._felt.newtons(q, progress.velocities[k], progress.accelerations[k], measured, seconds)
 
 

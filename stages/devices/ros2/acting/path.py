@@ -47,7 +47,7 @@ class Path:
     def goal(self, types: Types, names: Sequence[str], *, path: float, end: float, overtime: float) -> dict[str, Any]:
         """Fields of a FollowJointTrajectory goal, with tolerances for every joint; radians (metres), seconds."""
         points = [
-            {"positions": q, "velocities": v, "time_from_start": _duration(t)}
+            {"positions": q, "velocities": v, "time_from_start": duration(t)}
             for t, q, v in zip(self.times[1:], self.positions[1:], self.velocities[1:], strict=True)
         ]
         tolerances = [
@@ -58,7 +58,7 @@ class Path:
             "trajectory": self.trajectory(types, names, points),
             "path_tolerance": tolerances[0],
             "goal_tolerance": tolerances[1],
-            "goal_time_tolerance": _duration(overtime),
+            "goal_time_tolerance": duration(overtime),
         }
 
     @staticmethod
@@ -93,6 +93,7 @@ class Progress:
         return float(distances.min())
 
 
-def _duration(seconds: float) -> dict[str, int]:
+def duration(seconds: float) -> dict[str, int]:
+    """As ROS 2 has it."""
     whole, rest = divmod(round(seconds * 1e9), 10**9)
     return {"sec": whole, "nanosec": rest}

@@ -1,4 +1,4 @@
-"""A stage that has an arm move until something is wrong."""
+"""Stages that have an arm move, or a camera look, until something is wrong."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from runner.contract import Finished, Stage
-from stages.messages import Brake, RobotCommand, RobotState
+from runner.contract import Context, Finished, Stage
+from stages.messages import Brake, Frame, LookRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.robots import read_robot
 from tests.stages.devices.ros2.robot import ROBOT
@@ -29,6 +29,21 @@ class Commander(Stage):
         if robot_state.stopped:
             return Finished(code=0, reason=f"{robot_state.stopped}: {robot_state.reason}")
         return _turn(robot_state.positions[:6])
+
+
+class Looker(Stage):
+    """Asks for one look after the other."""
+
+    device: ClassVar[bool] = True
+
+    def on_start(self) -> LookRequest:
+        """The first one."""
+        return LookRequest(purpose="look 1")
+
+    def on_frame(self, frame: Frame, ctx: Context) -> LookRequest:
+        """The next one."""
+        ctx.log(f"has look {frame.index + 1}")
+        return LookRequest(purpose=f"look {frame.index + 2}")
 
 
 def _turn(start: np.ndarray) -> RobotCommand:

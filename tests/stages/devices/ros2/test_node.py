@@ -37,17 +37,25 @@ def test_messages_arrive_in_order_with_number_and_publisher() -> None:
 
 
 def test_who_comes_late_gets_what_was_latched_and_not_what_was_volatile() -> None:
+    witnessed: list[str] = []
     latched: list[str] = []
     volatile: list[str] = []
-    with router() as endpoint, node(endpoint, "talker") as talker, node(endpoint, "listener") as listener:
+    with (
+        router() as endpoint,
+        node(endpoint, "talker") as talker,
+        node(endpoint, "witness") as witness,
+        node(endpoint, "listener") as listener,
+    ):
         keeps, forgets = talker.publisher("kept", STRING, LATCHED), talker.publisher("gone", STRING)
+        witness.subscribe("gone", STRING, lambda one: witnessed.append(one.message.data))
+        assert talker.wait_for(forgets.endpoint, 5.0) == ""
         for word in ("first", "second"):
             keeps.put(talker.types.new(STRING, data=word))
             forgets.put(talker.types.new(STRING, data=word))
-        listener.subscribe("kept", STRING, lambda one: latched.append(one.message.data), LATCHED)
-        wait_until(lambda: latched)  # which comes after "second" on the same link: that has gone through the router
+        wait_until(lambda: witnessed == ["first", "second"])  # so both have gone through the router: now it is late
         listener.subscribe("gone", STRING, lambda one: volatile.append(one.message.data))
-        assert talker.wait_for(forgets.endpoint, 5.0) == ""
+        listener.subscribe("kept", STRING, lambda one: latched.append(one.message.data), LATCHED)
+        wait_until(lambda: latched)  # asked for after "gone" was subscribed to: the router knows of both
         forgets.put(talker.types.new(STRING, data="third"))
         wait_until(lambda: volatile)
     assert latched == ["second"]

@@ -71,6 +71,8 @@ def _simulator() -> Iterator[None]:
     def in_all_modules(function: Any, module: Any) -> Iterator[None]:
         with ExitStack() as stack:
             for each in (function, block_sum.fn, evolve.fn, refine.fn):
+                # A first warning adds this name to the function's globals, while another thread reads all of them.
+                each.__globals__.setdefault("__warningregistry__", {})
                 stack.enter_context(swapped(each, module))
             yield
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.poses import exp_so3, pose
-from stages.perception.refinement.colour import ColourSettings, log_odds
+from stages.perception.refinement.colour import ColourSettings, likeness, log_odds
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Mesh
@@ -55,6 +55,19 @@ def test_the_camera_does_not_matter(what: str) -> None:
     assert np.argmax(found) % 6 in ({4, 5, 0} if what == "beside depth" else {5})
 
 
+@pytest.mark.parametrize("light", [0.5, 1.2])
+def test_a_photograph_looks_like_what_is_there_and_not_like_what_merely_has_its_shape(light: float) -> None:
+    other = replace(CAN, colors=np.ascontiguousarray(CAN.colors[::-1]))
+    there = [
+        likeness(
+            np.clip(light * painted([(mesh, POSES[17])], VIEW).astype(float), 0, 255).astype(np.uint8),
+            VIEW, SHOWN, POSES, paint=Paint.of(CAN), settings=ColourSettings(),
+        )
+        for mesh in (CAN, other)
+    ]  # fmt: skip
+    assert there[0] > there[1] + 0.5, there
+
+
 def test_a_white_lid_is_no_black_one_in_bright_light() -> None:
     z, rim = CAN.vertices[:, 2], 0.002
     grey = np.where(z > z.max() - rim, 235, np.where(z < z.min() + rim, 25, 110))
@@ -77,4 +90,7 @@ def test_an_image_that_shows_nothing_says_little(seen: str) -> None:
 def test_a_few_pixels_say_nothing() -> None:
     few = np.zeros_like(SHOWN)
     few[80:88, 80:88] = True
-    assert not odds(painted([(CAN, STANDING)], VIEW), shown=few).any()
+    photograph = painted([(CAN, STANDING)], VIEW)
+    assert not odds(photograph, shown=few).any()
+    alike = likeness(photograph, VIEW, few, POSES[:1], paint=Paint.of(CAN), settings=ColourSettings())
+    assert np.isnan(alike)

@@ -56,7 +56,11 @@ def test_fingers_reach_into_the_object_and_keep_off_the_table(name: str) -> None
         tips, bottom = grasp.T_object_grasp[2, 3], entry.bounds[0, 2]
         assert tips < entry.bounds[1, 2]
         assert tips - bottom >= (0.065 if grasp.kind == "side" else FINGER_CLEARANCE) - 1e-9
-        assert grasp.T_object_grasp[2, 0] == pytest.approx(-1 if grasp.kind == "top" else 0)
+        down = -grasp.T_object_grasp[2, 0]
+        # The wall of a vessel may lean, and the fingers with it.
+        assert (
+            down > np.cos(np.deg2rad(20)) if "rim" in grasp.name else down == pytest.approx(float(grasp.kind == "top"))
+        )
 
 
 @pytest.mark.parametrize("name", NAMES)

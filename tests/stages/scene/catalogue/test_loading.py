@@ -57,7 +57,7 @@ def test_shorthands_expand(folder: Path) -> None:
     grasps:
       - side: {height: 0.07, azimuths: [90]}
       - top: {yaws: 4, width: 0.06}
-      - rim: {azimuths: [0], radius: 0.03, width: 0.005}
+      - rim: {azimuths: [0], radius: 0.03, width: 0.005, depth: 0.02, lean: 30}
       - pose: {name: odd, kind: top, approach: [0, 0, -2], closing: [1, 0, 0.5], at: [0, 0, 0], width: 0.05}
 """
     jar = load(folder, mesh() + body)["jar"]
@@ -69,6 +69,11 @@ def test_shorthands_expand(folder: Path) -> None:
     names = ["side 90", "side 90 rolled", "top 0", "top 90", "top 180", "top 270", "rim 0", "odd"]
     assert [grasp.name for grasp in jar.grasps] == names
     np.testing.assert_allclose(jar.grasps[-1].T_object_grasp[:3, 1], [1, 0, 0])
+    leaning = jar.grasps[-2].T_object_grasp
+    np.testing.assert_allclose(leaning[:3, 0], [-0.5, 0, -np.sqrt(0.75)])
+    np.testing.assert_allclose(
+        leaning[:3, 3] - 0.02 * leaning[:3, 0], [0.03, 0, jar.mesh.vertices[:, 2].max()], atol=1e-9
+    )
     assert jar.grasps[0].width == pytest.approx(0.06, abs=1e-6)
 
 

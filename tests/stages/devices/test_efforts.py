@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from stages.devices.ros2.acting.efforts import Efforts, Felt
+from stages.devices.efforts import Efforts, Felt
 from stages.robots import Robot, read_robot
 from tests.stages.devices.ros2.robot import ROBOT
 
@@ -47,7 +47,9 @@ def test_the_arms_own_weight_is_no_force_and_a_push_is(robot: Robot, model: Any)
     elsewhere = robot.home + 0.5
     # Motors never quite do what they say: what they said of the standing arm is taken off.
     offset = np.full(len(robot.joints), 0.7)
-    felt = Felt(Efforts(robot), robot.home, measured(model, robot, robot.home, none) + offset)
+    felt = Felt(
+        Efforts(robot, robot.joints, balanced=False), robot.home, measured(model, robot, robot.home, none) + offset
+    )
     free = [
         felt.newtons(elsewhere, still, still, measured(model, robot, elsewhere, none) + offset, t / 125)
         for t in range(50)

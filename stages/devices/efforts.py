@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -10,27 +11,28 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.robots import Robot
 
-_FILTER = 0.03
-"""Seconds over which efforts are smoothed."""
+FILTER = 0.03
+"""Seconds over which efforts are smoothed: servos answer a jump of the acceleration with a delay."""
 _SHORTEST_LEVER = 0.2
 """Metres: of joints whose axis passes closer to the hand hardly any force is felt, only friction."""
 
 
 class Efforts:
-    """Torques by inverse dynamics of the described robot, with its weight and an empty hand; J are its joints."""
+    """Torques of J joints by inverse dynamics of the described robot with an empty hand; other joints are at home."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, joints: Sequence[str], *, balanced: bool) -> None:
+        """``balanced``: the links that the description balances weigh nothing, as in simulation."""
         spec = robot.specification(seen=False)
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        for body in spec.bodies:
+        for body in () if balanced else spec.bodies:
             body.gravcomp = 0.0
         self._model: Any = spec.compile()
         self._data: Any = mujoco.MjData(self._model)
-        joints = [self._model.joint(name) for name in robot.joints]
+        named = [self._model.joint(name) for name in joints]
         self._addresses, self._dofs = (
-            np.array([getattr(one, key)[0] for one in joints]) for key in ("qposadr", "dofadr")
+            np.array([getattr(one, key)[0] for one in named]) for key in ("qposadr", "dofadr")
         )
-        self._turns = np.array([robot.body.turns(name) for name in robot.joints])
+        self._turns = np.array([robot.body.turns(name) for name in joints])
         self._hand = self._model.body(robot.gripper.link).id
         for name, position in robot.posture.items():
             self._data.joint(name).qpos[0] = position
@@ -44,10 +46,14 @@ class Efforts:
 
     def at_hand(self, outside: Floats) -> float:
         """The force of torques from outside (J) in newtons, as if it acted on the hand, where the arm is."""
-        linear = np.zeros((3, self._model.nv))
-        mujoco.mj_jacBody(self._model, self._data, linear, None, self._hand)
-        levers = np.maximum(np.linalg.norm(linear[:, self._dofs], axis=0), _SHORTEST_LEVER)
-        return float((np.abs(outside) / levers)[self._turns].max())
+        return float((np.abs(outside) / levers(self._model, self._data, self._hand, self._dofs))[self._turns].max())
+
+
+def levers(model: Any, data: Any, body: int, dofs: Any) -> Floats:
+    """Metres between a body and the axes of joints."""
+    linear = np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, linear, None, body)
+    return np.maximum(np.linalg.norm(linear[:, dofs], axis=0), _SHORTEST_LEVER)
 
 
 class Felt:
@@ -66,5 +72,5 @@ class Felt:
         outside = measured - self._offset - self._efforts.taken(q, v, a)
         passed = 0.0 if self._time is None else max(seconds - self._time, 0.0)
         self._time = seconds
-        self._outside = self._outside + (outside - self._outside) * (1 - np.exp(-passed / _FILTER))
+        self._outside = self._outside + (outside - self._outside) * (1 - np.exp(-passed / FILTER))
         return self._efforts.at_hand(self._outside)

@@ -1,0 +1,77 @@
+"""A plan gone through without an arm that moves: every motion of every transfer, for whoever looks on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.arrays import Floats
+from stages.geometry.poses import inverse
+from stages.messages import RobotCommand, Transfer
+from stages.planning.collision import CollisionWorld
+from stages.planning.motion import free_motion, robot_command
+from stages.planning.pick_place import MARGINS, Errand, PickPlace, PickPlacePlanner
+from stages.robots import Robot, Table
+from stages.scene.catalogue import CatalogueObject
+
+
+@dataclass
+class Rehearsal:
+    """Transfers one after the other, each in the scene that those before it leave."""
+
+    robot: Robot
+    table: Table
+    objects: Mapping[str, tuple[CatalogueObject, Floats]]
+    """By name, with T_base_object."""
+    rng: np.random.Generator
+    unreached: str = ""
+    """The transfer that no motions were found for, if there was one, and why."""
+
+    def commands(self, transfers: Sequence[Transfer]) -> Iterator[RobotCommand]:
+        """The arm's motions from home to home, as many transfers as there are motions for; the hand stays as it is."""
+        objects = dict(self.objects)
+        for transfer in transfers:
+            entry, T_base_object = objects[transfer.object]
+            errand = Errand(entry, T_base_object, transfer.T_base_targets, transfer.source, transfer.destination)
+            found = self._found(errand, transfer.object, objects)
+            if isinstance(found, str):
+                self.unreached = f"{transfer.object} to {transfer.destination}: {found}"
+                return
+            plan = found[-1]
+            yield from self._motions(*found)
+            objects[transfer.object] = entry, plan.place.hand.T_base_hand @ inverse(plan.place.hand.T_object_hand)
+
+    def _found(
+        self, errand: Errand, carried: str, objects: Mapping[str, tuple[CatalogueObject, Floats]]
+    ) -> tuple[CollisionWorld, PickPlacePlanner, PickPlace] | str:
+        """A way to do it with the widest margins that there is one with; else why there is none."""
+        why = ""
+        for margins in MARGINS:
+            world = CollisionWorld(self.robot, self.table, objects, carried=carried, clearance=margins.clearance)
+            planner = PickPlacePlanner(world, errand, self.rng, room=margins.room)
+            plan = next(planner.plans(self.robot.home), None)
+            if plan is not None:
+                return world, planner, plan
+            why = planner.obstacle[1]
+        return why
+
+    def _motions(self, world: CollisionWorld, planner: PickPlacePlanner, plan: PickPlace) -> Iterator[RobotCommand]:
+        name, pick, place = world.carried, plan.pick, plan.place
+        for label, path in (
+            (f"reach for {name}", plan.reach),
+            (f"close on {name}", pick.approach),
+            (f"lift {name}", pick.lift),
+            (f"carry {name}", plan.carry),
+            (f"lower {name}", place.lower),
+        ):
+            yield robot_command(self.robot, label, path)
+        retreat = planner.retreat(place.hand, place.lower[-1])
+        assert retreat is not None  # The place was chosen for it.
+        yield robot_command(self.robot, "retreat", retreat)
+        world.move(place.hand.T_base_hand @ inverse(place.hand.T_object_hand))
+        world.set_width(self.robot.gripper.open_width)
+        home = free_motion(world, retreat[-1], self.robot.home, self.rng)
+        if home is not None:
+            yield robot_command(self.robot, "go home", home)
