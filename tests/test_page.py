@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from runner.testing import finish, read_until, runner, start_graph
+from runner.testing import Run, finish, read_until, runner, start_graph
 from stages.messages import Answer, Question
 from tests.runner.page.browser import browser, faults, opened
 
@@ -18,58 +20,47 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    process = start_graph(
-        ROOT / "graphs" / "interactive.yaml",
-        "world.seed=1",
-        "corrector.calibrate=false",
-        folder=tmp_path,
-        options=["--page"],
-    )
-    try:
-        printed = read_until(process, "processes are ready")
-        (url,) = re.findall(r"page: (\S+)", printed)
-        with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
-            teaches(page)
-            listed = runner("goals").communicate(timeout=60)[0]
-            assert listed.startswith("breakfast\n    6 objects: the ")
-            assert "runner call demonstrator restore name=breakfast ask=true" in listed
-            edits(page)
-            restores_and_stops(page)
-            tells_it_in_german(page)
-    finally:
-        process.terminate()
-    run = finish(process, tmp_path, before=printed)
-    assert "COMPLETE" in run.output
+    with paged(tmp_path, monkeypatch, "world.seed=1") as (page, run):
+        teaches(page)
+        listed = runner("goals").communicate(timeout=60)[0]
+        assert listed.startswith("breakfast\n    6 objects: the ")
+        assert "runner call demonstrator restore name=breakfast ask=true" in listed
+        edits(page)
+        restores_and_stops(page)
+        tells_it_in_german(page)
+    assert "COMPLETE" in run().output
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_person_is_asked_what_a_look_leaves_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The detector does not know the tea box; of the two salt shakers the goal has one."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    process = start_graph(
-        ROOT / "graphs" / "interactive.yaml",
-        *("world.suite=twins", "world.seed=28", "corrector.calibrate=false", "detector.labels=[salt_shaker]"),
-        folder=tmp_path,
-        options=["--page"],
-    )
+    twins = ("world.suite=twins", "world.seed=28", "detector.labels=[salt_shaker]")
+    with paged(tmp_path, monkeypatch, *twins) as (page, run):
+        answers_about_the_unknown(page)
+        says_which_is_meant(page)
+    found = run()
+    assert "COMPLETE" in found.output
+    assert [one.doubt.key for one in found.messages(Question)] == ["unknown", "unknown", "which salt_shaker", "unknown"]
+    assert [one.choice for one in found.messages(Answer)] == ["again", "leave", "salt_shaker_2", "leave"]
+    again = runner("replay", str(found.recording), "--verify")
+    assert "IDENTICAL" in again.communicate(timeout=300)[0] and again.returncode == 0
+
+
+@contextmanager
+def paged(folder: Path, monkeypatch: pytest.MonkeyPatch, *settings: str) -> Generator[tuple[Page, Callable[[], Run]]]:
+    """A robot that waits for a person, on its page; the run, once that has been left."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    monkeypatch.setenv("XDG_DATA_HOME", str(folder))
+    graph = ROOT / "graphs" / "interactive.yaml"
+    process = start_graph(graph, *settings, "corrector.calibrate=false", folder=folder, options=["--page"])
     try:
         printed = read_until(process, "processes are ready")
         (url,) = re.findall(r"page: (\S+)", printed)
         with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
-            answers_about_the_unknown(page)
-            says_which_is_meant(page)
+            yield page, lambda: finish(process, folder, before=printed)
     finally:
         process.terminate()
-    run = finish(process, tmp_path, before=printed)
-    assert "COMPLETE" in run.output
-    assert [one.doubt.key for one in run.messages(Question)] == ["unknown", "unknown", "which salt_shaker", "unknown"]
-    assert [one.choice for one in run.messages(Answer)] == ["again", "leave", "salt_shaker_2", "leave"]
-    again = runner("replay", str(run.recording), "--verify")
-    assert "IDENTICAL" in again.communicate(timeout=300)[0] and again.returncode == 0
 
 
 def answers_about_the_unknown(page: Page) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -21,8 +21,6 @@ from runner.transport.bus import Bus
 T = TypeVar("T")
 ANSWER_SECONDS = 10.0
 POLL_SECONDS = 0.1
-MOMENT_SECONDS = 0.03
-"""What comes within one another is told at once."""
 RESTART_SECONDS = 300.0
 """Bringing a stage back takes as long as its models take to load."""
 WINDOW_NS = 10_000_000_000
@@ -104,15 +102,6 @@ class Live(contextlib.AbstractContextManager["Live"]):
             while backlog:
                 yield backlog.popleft()
             time.sleep(POLL_SECONDS)
-
-    def overheard(self, topics: Iterable[str]) -> Iterator[list[Packet]]:
-        """Messages of several topics as they come, those of a moment at once; never ends, and yields nothing, too."""
-        backlog = deque[Packet](maxlen=BACKLOG)
-        for topic in topics:
-            self.bus.hand_over(f"m/{topic}", backlog.append)
-        while True:
-            time.sleep(MOMENT_SECONDS)
-            yield [backlog.popleft() for _ in range(len(backlog))]
 
     def headers(self, topic: str) -> Iterator[list[Header]]:
         """Once a second the headers of the last ten seconds, until the run ends."""

@@ -106,7 +106,7 @@ class Page:
         self._watch.start()
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(work) for work in (self._tell(), self._ask_how_it_is(), self._listen())]
+                tasks = [group.create_task(work) for work in (self._tell(), self._ask_how_it_is())]
                 while await run_in_threadpool(is_alive, self._entry):
                     await asyncio.sleep(STATUS_SECONDS)
                 for task in tasks:
@@ -170,13 +170,6 @@ class Page:
             if self._an_engineer_looks:
                 self._feed.put("log", list(self._watch.lines))
             await asyncio.sleep(0.05)
-
-    async def _listen(self) -> None:
-        """Hears what is sent while somebody looks; where the run does not answer, it is asked again."""
-        while True:
-            await self._looks.wait()
-            await run_in_threadpool(self._watch.listen, self._entry)
-            await asyncio.sleep(STATUS_SECONDS)
 
     async def _ask_how_it_is(self) -> None:
         """Asks until every process is ready, and from then on while an engineer looks."""

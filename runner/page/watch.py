@@ -1,8 +1,7 @@
 """Follows a run while somebody looks at the page, and keeps what there is to tell.
 
-Like `runner view` it reads what is on the disk: however slow a page is, the graph never waits for it. Once it has read
-all, it hears messages at the gateway too, where they are some tenths of a second sooner; what is dropped there it reads
-later. While nobody looks, nothing is read or heard.
+Like `runner view` it reads what is on the disk: however slow a page is, the graph never waits for it, and nothing is
+sent once more. While nobody looks, nothing is read.
 """
 
 from __future__ import annotations
@@ -17,17 +16,13 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-from runner.contract import Message, Refused
+from runner.contract import Message
 from runner.graph.graph import Graph, graph_from_json
-from runner.live.live import Live
 from runner.message.codec import CodecError, Envelope, LogLine, open_envelope, unpack
-from runner.message.ids import Recent
 from runner.page.story import Doing, Heard, Language, Story, Told, load_story
 from runner.recording.container import POLL_SECONDS, Container, Entry, Growing, open_file
 from runner.recording.recording import LOG, RUN
-from runner.supervise.registry import Entry as Run
 
-KEPT_IDS = 1000
 KEPT_LINES = 300
 """Log lines that a page shows."""
 NOTHING = Told(Doing(""))
@@ -44,14 +39,12 @@ class Watch:
         """When the first record was made, nanoseconds since the epoch."""
         self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
         self.caught_up = False
-        """Whether all was read that there is: before, what is sent now would be told too soon."""
+        """Whether all was read that there is: before, there is only the past to tell."""
         self._recording = recording
         self._changed = changed
         self._stopped = stopped
         self._looked_at = threading.Event()
         self._telling = threading.Lock()
-        self._taken = Recent[str, None](KEPT_IDS)
-        """Ids of what was heard or read: each may come twice."""
         self._story: Story | None = None
         self._prepared = False
         self._heard: dict[str, type[Message]] = {}
@@ -65,17 +58,6 @@ class Watch:
         """Goes on where somebody looks, and rests where nobody does."""
         self._looked_at.set() if somebody else self._looked_at.clear()
         self.caught_up &= somebody
-
-    def listen(self, entry: Run) -> None:
-        """Hears what is sent until nobody looks, or the run does not answer any more."""
-        while not (self._prepared or self._stopped()):
-            time.sleep(POLL_SECONDS)
-        with contextlib.suppress(Refused), Live(entry) as live:
-            for packets in live.overheard(self._heard):
-                for packet in packets if self.caught_up else ():
-                    self._hear(self._heard[packet.key.removeprefix("m/")], packet.payload, time.time_ns())
-                if not self._looked_at.is_set() or self._stopped():
-                    return
 
     def tell(self, language: Language) -> Told:
         """What there is to say now."""
@@ -132,11 +114,8 @@ class Watch:
         assert self._story is not None
         try:
             sealed = unpack(Envelope, payload)
+            heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, time_ns)
             with self._telling:
-                if sealed.id in self._taken:
-                    return
-                self._taken[sealed.id] = None
-                heard = Heard(open_envelope(kind, sealed), sealed.id, sealed.causes, time_ns)
                 self._story.hear(heard)
             self.newest = heard
             self._changed()

@@ -44,7 +44,8 @@ from runner.recording.recording import (
 
 FLUSH_SECONDS = 0.25
 """A killed recorder loses no more than this."""
-CHUNK_BYTES = 2**20
+CHUNK_BYTES = 2**19
+"""A chunk that holds more is closed at once: a picture can be read as soon as it is written."""
 REST_SECONDS = 0.02
 """What may come together before it is written."""
 BACKLOG_BYTES = 2**30
@@ -225,11 +226,12 @@ class RecordingWriter:
 
     def _write_waiting(self, due: float) -> float:
         """Writes what waits, and closes a chunk when it is ``due``; returns when the next is."""
-        while self._waiting or time.monotonic() >= due:
+        while True:
             if time.monotonic() >= due or self._chunk_bytes > CHUNK_BYTES:
                 self._flush()
                 due = time.monotonic() + FLUSH_SECONDS
-                continue
+            if not self._waiting:
+                return due
             payload = self._waiting[0]
             if isinstance(payload, _Payload):
                 self._write(payload)
@@ -237,7 +239,6 @@ class RecordingWriter:
                 self._flush()
                 self._waiting.popleft()
                 payload()
-        return due
 
     def _write(self, payload: _Payload) -> None:
         """Writes the first that waits. What fails on the way is among what waits or what is not proved yet."""

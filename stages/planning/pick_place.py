@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from itertools import chain, islice, product
@@ -11,10 +11,11 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, raised
-from stages.messages.task import FailedStage
+from stages.messages.task import FailedStage, Transfer
 from stages.planning.collision import CollisionWorld
 from stages.planning.grasps import HandPose, approaches, distinct_grasps, hand_poses
 from stages.planning.motion import free_motion, restarts, solve_ik, straight_motion
+from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Grasp
 
 LIFT = 0.12
@@ -275,3 +276,21 @@ class PickPlacePlanner:
         order = ("ik", "pick motion", "place motion")
         if order.index(stage) >= order.index(self.obstacle[0]):
             self.obstacle = (stage, reason)
+
+
+def planners(
+    robot: Robot,
+    table: Table,
+    objects: Mapping[str, tuple[CatalogueObject, Floats]],
+    transfer: Transfer,
+    rng: np.random.Generator,
+) -> Iterator[tuple[CollisionWorld, PickPlacePlanner]]:
+    """Planners for one transfer, and the scene that each plans in; those with the widest margins come first.
+
+    ``objects``: by name, with T_base_object.
+    """
+    entry, T_base_object = objects[transfer.object]
+    errand = Errand(entry, T_base_object, transfer.T_base_targets, transfer.source, transfer.destination)
+    for margins in MARGINS:
+        world = CollisionWorld(robot, table, objects, carried=transfer.object, clearance=margins.clearance)
+        yield world, PickPlacePlanner(world, errand, rng, room=margins.room)

@@ -12,7 +12,7 @@ from stages.geometry.poses import inverse
 from stages.messages import RobotCommand, Transfer
 from stages.planning.collision import CollisionWorld
 from stages.planning.motion import free_motion, robot_command
-from stages.planning.pick_place import MARGINS, Errand, PickPlace, PickPlacePlanner
+from stages.planning.pick_place import PickPlace, PickPlacePlanner, planners
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject
 
@@ -33,24 +33,23 @@ class Rehearsal:
         """The arm's motions from home to home, as many transfers as there are motions for; the hand stays as it is."""
         objects = dict(self.objects)
         for transfer in transfers:
-            entry, T_base_object = objects[transfer.object]
-            errand = Errand(entry, T_base_object, transfer.T_base_targets, transfer.source, transfer.destination)
-            found = self._found(errand, transfer.object, objects)
+            found = self._found(transfer, objects)
             if isinstance(found, str):
                 self.unreached = f"{transfer.object} to {transfer.destination}: {found}"
                 return
             plan = found[-1]
             yield from self._motions(*found)
-            objects[transfer.object] = entry, plan.place.hand.T_base_hand @ inverse(plan.place.hand.T_object_hand)
+            objects[transfer.object] = (
+                objects[transfer.object][0],
+                plan.place.hand.T_base_hand @ inverse(plan.place.hand.T_object_hand),
+            )
 
     def _found(
-        self, errand: Errand, carried: str, objects: Mapping[str, tuple[CatalogueObject, Floats]]
+        self, transfer: Transfer, objects: Mapping[str, tuple[CatalogueObject, Floats]]
     ) -> tuple[CollisionWorld, PickPlacePlanner, PickPlace] | str:
         """A way to do it with the widest margins that there is one with; else why there is none."""
         why = ""
-        for margins in MARGINS:
-            world = CollisionWorld(self.robot, self.table, objects, carried=carried, clearance=margins.clearance)
-            planner = PickPlacePlanner(world, errand, self.rng, room=margins.room)
+        for world, planner in planners(self.robot, self.table, objects, transfer, self.rng):
             plan = next(planner.plans(self.robot.home), None)
             if plan is not None:
                 return world, planner, plan

@@ -21,11 +21,11 @@ from stages.planning.pick_place import (
     HOVER,
     LIFT,
     MARGINS,
-    Errand,
     Pick,
     PickPlace,
     PickPlacePlanner,
     Place,
+    planners,
 )
 from stages.planning.rehearsal import Rehearsal
 from stages.robots import Robot, Table
@@ -185,7 +185,7 @@ class TransferRoutine:
         """From wherever the arm stands: what is held goes back to where it was taken from, the hand goes home."""
         at, q = self._under_way, self._arm(state)
         if at is None:
-            return (yield from self._home(self._world(MARGINS[-1].clearance), q, rise=rise))
+            return (yield from self._home(self._world(), q, rise=rise))
         if self.in_hand:
             state = yield from self._do("feel what is in the hand", width=0.0)
             if state.gripper_width > self._robot.gripper.closed_width + _EMPTY:
@@ -221,13 +221,12 @@ class TransferRoutine:
         q = self._arm(state)
         if np.abs(q - self._robot.home).max() < _AWAY:
             return "", ""
-        return (yield from self._home(self._world(MARGINS[-1].clearance), q))
+        return (yield from self._home(self._world(), q))
 
     def _try_plans(self) -> Steps:
         failure: tuple[FailedStage, str] = ("ik", "")
-        for margins in MARGINS:
-            world = self._world(margins.clearance)
-            planner = PickPlacePlanner(world, self._errand(), self._rng, room=margins.room)
+        request = self._request.transfer
+        for world, planner in planners(self._robot, self._table, self._objects, request, self._rng):
             for plan in self._timed(planner.plans(self._robot.home)):
                 self._under_way = _UnderWay(world, planner, plan)
                 failure = yield from self._execute(self._under_way)
@@ -393,14 +392,10 @@ class TransferRoutine:
         onward = None if rise is None else free_motion(world, rise[-1], self._robot.home, self._rng)
         return None if rise is None or onward is None else np.vstack([rise, onward])
 
-    def _world(self, clearance: float) -> CollisionWorld:
-        carried = self._request.transfer.object
+    def _world(self) -> CollisionWorld:
+        """The scene, with the least margins: for ways home."""
+        carried, clearance = self._request.transfer.object, MARGINS[-1].clearance
         return CollisionWorld(self._robot, self._table, self._objects, carried=carried, clearance=clearance)
-
-    def _errand(self) -> Errand:
-        transfer = self._request.transfer
-        entry, T = self._objects[transfer.object]
-        return Errand(entry, T, transfer.T_base_targets, transfer.source, transfer.destination)
 
     def _timed(self, plans: Iterator[PickPlace]) -> Iterator[PickPlace]:
         """The same plans; the time spent on each is counted."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import re
 import signal
 from collections.abc import Iterator
@@ -17,9 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 from websockets.sync.client import connect
 
 from runner.contract import Refused
-from runner.live.live import Live
 from runner.page.guard import new_token
-from runner.supervise.registry import find_run
 from runner.testing import finish, read_until, runner, start_graph
 from tests.runner.common.waiting import wait_until
 from tests.runner.page.browser import browser, faults, opened
@@ -233,26 +230,6 @@ def test_a_page_that_stands_still_keeps_nobody_waiting(lamp: Lamp, page: Page) -
             assert asked(lamp.url, f"{place.path}call", "POST", body)[0] == 200
         page.goto(f"{lamp.url}#engineer")
         expect(page.get_by_role("log")).to_contain_text("is dark 199")
-
-
-def test_a_page_need_not_wait_for_the_recorder(page: Page) -> None:
-    blinked = page.get_by_text("has blinked")
-    page.get_by_label("How often").fill("1")
-    with Live(find_run(None)) as live:
-        (recorder,) = [one.pid for one in live.status().processes if one.stage == "recorder"]
-    (before,) = re.findall(r"\d+", blinked.inner_text())
-    after = re.compile(rf"has blinked {int(before) + 1} times")
-    page.wait_for_timeout(500)  # until it has read what there is
-    os.kill(recorder, signal.SIGSTOP)
-    try:
-        page.keyboard.press("Enter")
-        expect(blinked).to_have_text(after)
-    finally:
-        os.kill(recorder, signal.SIGCONT)
-    page.get_by_role("link", name="Engineer").click()
-    expect(page.get_by_text("Answer").first).to_be_visible()
-    page.get_by_role("link", name="Scene").click()
-    expect(blinked).to_have_text(after)
 
 
 def test_escape_stops_wherever_the_focus_is(page: Page) -> None:
