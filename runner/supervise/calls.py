@@ -18,7 +18,7 @@ from runner.contract import Command, Level, Refused
 from runner.graph.document import suggest
 from runner.graph.graph import Graph, Node, command_port
 from runner.graph.ports import port_name
-from runner.message.codec import LogLine, Step
+from runner.message.codec import CodecError, LogLine, Step
 from runner.message.ids import MessageId, Recent
 
 KEPT = 100
@@ -128,7 +128,10 @@ class Calls:
         replicas = set(range(self._graph.nodes[request.stage].replicas))
         call = _Call(request.stage, frozenset(map(port_name, kind.answers)), replicas)
         port = command_port(request.stage, request.command)
-        return self._publish(port, command, lambda id: self._remember(id, call))
+        try:
+            return self._publish(port, command, lambda id: self._remember(id, call))
+        except CodecError as error:  # what no message can hold, as an integer of 100 digits
+            raise Refused(f"{request.stage} {request.command}: {error}") from None
 
     def progress(self, question: CallQuestion) -> Progress:
         """Waits for news of a call, but not for long."""

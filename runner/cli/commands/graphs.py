@@ -83,11 +83,14 @@ def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
     from runner.page.start import page_beside, require_page
     from runner.process.fork_server import ForkServer
     from runner.supervise.supervisor import Supervisor
+    from runner.view.views import load_views
 
     gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, options.settings)
     if options.page or graph.page:
         require_page()
+    if options.view:
+        load_views(graph)
     forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(
         graph.here() if options.here else graph,

@@ -213,6 +213,8 @@ def test_a_stage_does_what_is_called(account: Run) -> None:
         (emitted,) = call(live, "add", amount="-2").emitted
         assert emitted.startswith("account.sum#")
         assert call(live, "add", amount="0").refused == "amount=0: nothing to add; valid: any other number"
+        with pytest.raises(Refused, match=r"^account add: Add.*: .*(range|64|large|integer)"):
+            call(live, "add", amount="9" * 100)
         before = sum_of(call(live, "collect", count="1"))
         assert sum_of(call(live, "collect", count="3")) == before + 3
 

@@ -17,6 +17,7 @@ from runner.message.codec import Envelope, envelope
 from runner.page.viewer import drawn
 from runner.recording.recording import Recording
 from runner.recording.writer import RecordingWriter
+from runner.testing import runner
 from runner.view.rerun_view import follow, newest_live, save_rrd, screenshot, view_recording
 from runner.view.views import load_views
 from tests.runner.common.recordings import TOYS, manifest, put, record_toys
@@ -62,6 +63,9 @@ def test_refuses_a_graph_without_views_or_with_unknown_ones(tmp_path: Path):
         load_views(load_graph(TOYS, (sink,)))
     with pytest.raises(Refused, match="no class 'Nothing' in tests"):
         load_views(load_graph(TOYS, (sink, "view=tests.runner.common.toy_views:Nothing")))
+    process = runner("up", str(TOYS), "--set", sink, "--view", "--recordings", str(tmp_path / "none"))
+    assert "graph 'toys' names no views" in process.communicate(timeout=60)[0] and process.returncode == 2
+    assert not (tmp_path / "none").exists()
 
 
 def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
