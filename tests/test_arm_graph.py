@@ -10,8 +10,9 @@ from runner.contract import Refused
 from runner.graph.graph import load_graph
 from runner.testing import finish, read_until, start_graph
 from stages.messages import Frame, LookRequest, RobotCommand, RobotState, Ros2Heard, Ros2Sent
+from tests.runner.common.waiting import wait_until
 from tests.stages.devices.ros2.bags import SOURCE
-from tests.stages.devices.ros2.lab import free_port, node, open_router, router, wait_until
+from tests.stages.devices.ros2.lab import free_port, node, open_router, router
 from tests.stages.devices.ros2.robot import ROBOT, WHERE, FakeRobot
 from tests.stages.devices.ros2.test_live import Driver
 

@@ -19,7 +19,8 @@ from stages.devices.ros2.settings import Care, Controllers, Link
 from stages.messages import Brake, RobotCommand, RobotState, Ros2Heard, Ros2Sent
 from stages.messages.robot import Guard
 from stages.robots import read_robot
-from tests.stages.devices.ros2.lab import free_port, node, open_router, router, wait_until
+from tests.runner.common.waiting import wait_until
+from tests.stages.devices.ros2.lab import free_port, node, open_router, router
 from tests.stages.devices.ros2.robot import JOINTS, ROBOT, WHERE, FakeRobot
 
 HOME = read_robot(ROBOT).home

@@ -20,7 +20,8 @@ from stages.devices.ros2.wire import LATCHED
 from stages.messages import Asked, Frame, Goal, LookRequest, Ros2Sent, SceneEstimate, SceneGraph, Verdict
 from stages.ros2 import Ros2Demonstration, Ros2Scenes, sentence
 from stages.scene.catalogue import BUILT_IN
-from tests.stages.devices.ros2.lab import node, router, wait_until
+from tests.runner.common.waiting import wait_until
+from tests.stages.devices.ros2.lab import PATIENCE, node, router
 
 ROOT = Path(__file__).parents[2]
 TRIGGER = "std_srvs/srv/Trigger"
@@ -39,7 +40,7 @@ def look() -> dict[str, Any]:
 
 def call(lab: Node, service: str) -> Any:
     client = Client(lab, service, TRIGGER)
-    assert lab.wait_for(client.endpoint, 5.0) == ""
+    assert lab.wait_for(client.endpoint, PATIENCE) == ""
     return client.start(seconds=30.0)
 
 
@@ -49,7 +50,7 @@ def test_a_node_asks_for_a_look_and_gets_its_scene(look: dict[str, Any]) -> None
     with router() as endpoint, node(endpoint, "lab") as lab:
         stage = Ros2Scenes(Ros2Scenes.Config(catalogue=BUILT_IN, link=Link(router=endpoint)))
         heard = lab.subscribe(f"{NAME}/detections", "vision_msgs/msg/Detection3DArray", detections.append)
-        assert lab.wait_for(heard, 5.0) == ""
+        assert lab.wait_for(heard, PATIENCE) == ""
         future = call(lab, f"{NAME}/look")
         (request,) = run_stage(stage, limit=1)
         assert request == LookRequest(purpose="look 1: asked by a node")

@@ -6,8 +6,7 @@ import contextlib
 import json
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,8 @@ from stages.devices.ros2.settings import Link
 from stages.devices.ros2.wire import LATCHED
 
 TRAJECTORY = "control_msgs/action/FollowJointTrajectory"
+PATIENCE = 30.0
+"""Seconds for what a machine with nothing else to do needs a tenth of a second for."""
 
 
 def free_port() -> int:
@@ -64,14 +65,6 @@ def node(endpoint: str, name: str, said: list[str] | None = None, **settings: An
         one.close()
     if said is None:
         assert warnings == []
-
-
-def wait_until(holds: Callable[[], Any], seconds: float = 10.0) -> None:
-    """Waits until something holds; fails where it never does."""
-    limit = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < limit, "never came true"
-        time.sleep(0.01)
 
 
 class ActionServer:

@@ -14,7 +14,8 @@ from stages.devices.ros2.node import Node, Received
 from stages.devices.ros2.services import ActionClient, Client, Request, Unanswered, serve
 from stages.devices.ros2.settings import Link
 from stages.devices.ros2.wire import LATCHED
-from tests.stages.devices.ros2.lab import TRAJECTORY, ActionServer, free_port, node, open_router, router, wait_until
+from tests.runner.common.waiting import wait_until
+from tests.stages.devices.ros2.lab import PATIENCE, TRAJECTORY, ActionServer, free_port, node, open_router, router
 
 STRING, JOINTS = "std_msgs/msg/String", "sensor_msgs/msg/JointState"
 TRIGGER = "std_srvs/srv/Trigger"
@@ -26,8 +27,8 @@ def test_messages_arrive_in_order_with_number_and_publisher() -> None:
     with router() as endpoint, node(endpoint, "talker") as talker, node(endpoint, "listener") as listener:
         publisher = talker.publisher("joint_states", JOINTS)
         subscription = listener.subscribe("/joint_states", JOINTS, got.append)
-        assert listener.wait_for(subscription, 5.0) == ""
-        assert talker.wait_for(publisher.endpoint, 5.0) == ""
+        assert listener.wait_for(subscription, PATIENCE) == ""
+        assert talker.wait_for(publisher.endpoint, PATIENCE) == ""
         for number in range(20):
             publisher.put(talker.types.new(JOINTS, name=["j1"], position=[number / 10]))
         wait_until(lambda: len(got) == 20)
@@ -48,7 +49,7 @@ def test_who_comes_late_gets_what_was_latched_and_not_what_was_volatile() -> Non
     ):
         keeps, forgets = talker.publisher("kept", STRING, LATCHED), talker.publisher("gone", STRING)
         witness.subscribe("gone", STRING, lambda one: witnessed.append(one.message.data))
-        assert talker.wait_for(forgets.endpoint, 5.0) == ""
+        assert talker.wait_for(forgets.endpoint, PATIENCE) == ""
         for word in ("first", "second"):
             keeps.put(talker.types.new(STRING, data=word))
             forgets.put(talker.types.new(STRING, data=word))
@@ -68,10 +69,10 @@ def test_a_service_answers_each_call_and_may_take_its_time() -> None:
         response = server.types.new("std_srvs/srv/SetBool_Response", success=True, message="now")
         serve(server, "now", "std_srvs/srv/SetBool", lambda request: request.answer(response))
         serve(server, "later", TRIGGER, waiting.append)
-        assert Client(client, "now", "std_srvs/srv/SetBool").call(seconds=5.0, data=True).message == "now"
+        assert Client(client, "now", "std_srvs/srv/SetBool").call(seconds=PATIENCE, data=True).message == "now"
         later = Client(client, "later", TRIGGER)
-        assert client.wait_for(later.endpoint, 5.0) == ""
-        future = later.start(seconds=5.0)
+        assert client.wait_for(later.endpoint, PATIENCE) == ""
+        future = later.start(seconds=PATIENCE)
         wait_until(lambda: waiting)
         assert not future.done()
         waiting[0].answer(server.types.new(f"{TRIGGER}_Response", success=True, message="at last"))
@@ -83,10 +84,10 @@ def test_an_action_gives_feedback_and_a_result() -> None:
     with router() as endpoint, node(endpoint, "arm") as arm, node(endpoint, "client") as client:
         server = ActionServer(arm, "/arm/follow")
         actions = ActionClient(client, "/arm/follow", TRAJECTORY)
-        assert arm.wait_for(server.feedback.endpoint, 5.0) == ""
+        assert arm.wait_for(server.feedback.endpoint, PATIENCE) == ""
         goal = actions.send(
             bytes(range(16)),
-            seconds=5.0,
+            seconds=PATIENCE,
             feedback=lambda one: seen.append(float(one.actual.positions[0])),
             trajectory=POINTS,
         )
@@ -99,13 +100,13 @@ def test_a_goal_is_canceled_or_rejected() -> None:
     with router() as endpoint, node(endpoint, "arm") as arm, node(endpoint, "client") as client:
         ActionServer(arm, "held", held=True)
         ActionServer(arm, "picky", accepts=False)
-        goal = ActionClient(client, "held", TRAJECTORY).send(bytes(16), seconds=5.0, trajectory=POINTS)
+        goal = ActionClient(client, "held", TRAJECTORY).send(bytes(16), seconds=PATIENCE, trajectory=POINTS)
         with pytest.raises(TimeoutError):
             goal.result(0.1)
         assert goal.cancel(5.0)
         assert goal.result(5.0)[0] == "canceled"
         with pytest.raises(Unanswered, match="/picky/_action/send_goal: the goal was rejected"):
-            ActionClient(client, "picky", TRAJECTORY).send(bytes(16), seconds=5.0)
+            ActionClient(client, "picky", TRAJECTORY).send(bytes(16), seconds=PATIENCE)
 
 
 def test_another_hash_is_named_with_the_distribution_that_has_it() -> None:
@@ -143,7 +144,7 @@ def test_a_server_that_goes_away_ends_the_call() -> None:
         with node(endpoint, "server") as server:
             serve(server, "slow", TRIGGER, waiting.append)
             slow = Client(client, "slow", TRIGGER)
-            assert client.wait_for(slow.endpoint, 5.0) == ""
+            assert client.wait_for(slow.endpoint, PATIENCE) == ""
             future = slow.start(seconds=60.0)
             wait_until(lambda: waiting)
             waiting.clear()
@@ -157,7 +158,7 @@ def test_a_client_that_goes_away_troubles_nobody() -> None:
         serve(server, "slow", TRIGGER, waiting.append)
         with node(endpoint, "client") as client:
             slow = Client(client, "slow", TRIGGER)
-            assert client.wait_for(slow.endpoint, 5.0) == ""
+            assert client.wait_for(slow.endpoint, PATIENCE) == ""
             slow.start(seconds=60.0)
             wait_until(lambda: waiting)
         waiting[0].answer(server.types.new(f"{TRIGGER}_Response", success=True))
@@ -179,7 +180,7 @@ def test_a_router_that_is_killed_and_comes_back_is_found_again() -> None:
         response = talker.types.new(f"{TRIGGER}_Response", message="there")
         serve(talker, "there", TRIGGER, lambda request: request.answer(response))
         client = Client(listener, "there", TRIGGER)
-        assert listener.wait_for(subscription, 5.0) == ""
+        assert listener.wait_for(subscription, PATIENCE) == ""
         first.close()
         wait_until(lambda: "nobody publishes it" in listener.obstacle(subscription))
         second = open_router(port)
@@ -240,7 +241,7 @@ def test_what_cannot_be_read_is_left_out_and_named() -> None:
     with router() as endpoint, node(endpoint, "listener", said) as listener, node(endpoint, "odd") as odd:
         subscription = listener.subscribe("words", STRING, got.append)
         publisher = odd.publisher("words", STRING)
-        assert odd.wait_for(publisher.endpoint, 5.0) == ""
+        assert odd.wait_for(publisher.endpoint, PATIENCE) == ""
         odd.session.put(subscription.key, odd.types.encode(odd.types.new(STRING, data="anonymous")))
         odd.session.put(subscription.key, b"\0\1\0\0\xff\xff\0\0", attachment=b"\0" * 16 + b"\x10" + b"\0" * 16)
         publisher.put(odd.types.new(STRING, data="well"))

@@ -17,7 +17,8 @@ import zenoh_ros2_sdk as sdk
 
 from stages.devices.ros2.node import Received
 from stages.devices.ros2.services import Client, serve
-from tests.stages.devices.ros2.lab import node, router, wait_until
+from tests.runner.common.waiting import wait_until
+from tests.stages.devices.ros2.lab import PATIENCE, node, router
 
 os.environ["CYDR_CACHE_DIR"] = str(Path(__file__).parents[4] / "build" / "cydr")
 COMPILES = shutil.which("cc") is not None and Path(sysconfig.get_path("include"), "Python.h").exists()
@@ -57,10 +58,10 @@ def test_topics_with_pyzeros() -> None:
         publisher = theirs.create_publisher(JointState, "/from_them", scope=None)
         subscribed = ours.subscribe("/from_them", JOINTS, heard.append)
         published = ours.publisher("/from_us", JOINTS)
-        assert ours.wait_for(subscribed, 5.0) == "" == ours.wait_for(published.endpoint, 5.0)
+        assert ours.wait_for(subscribed, PATIENCE) == "" == ours.wait_for(published.endpoint, PATIENCE)
         publisher.publish(JointState(name=["j1"], position=[0.5]))
         published.put(ours.types.new(JOINTS, header={"frame_id": "base"}, name=["a", "bc"], velocity=[1.0, 2.0]))
-        return await asyncio.wait_for(anext(subscription.listen_reliable()), 5.0)
+        return await asyncio.wait_for(anext(subscription.listen_reliable()), PATIENCE)
 
     with router() as endpoint, node(endpoint, "ours") as ours, pyzeros_node(endpoint) as theirs:
         got = asyncio.run(exchange(theirs))
@@ -77,11 +78,11 @@ def test_services_with_pyzeros() -> None:
     async def exchange(theirs: Any) -> tuple[Any, Any]:
         server = theirs.create_service(SetBool, "/theirs", scope=None)
         client = theirs.create_client(SetBool, "/ours", scope=None)
-        await asyncio.wait_for(client.wait_for_service(), 5.0)
-        answer = await asyncio.wait_for(client.call_async(SetBool.Request(data=True)), 5.0)
-        call = asyncio.to_thread(Client(ours, "/theirs", SET_BOOL).call, seconds=5.0, data=True)
+        await asyncio.wait_for(client.wait_for_service(), PATIENCE)
+        answer = await asyncio.wait_for(client.call_async(SetBool.Request(data=True)), PATIENCE)
+        call = asyncio.to_thread(Client(ours, "/theirs", SET_BOOL).call, seconds=PATIENCE, data=True)
         asked = asyncio.create_task(call)
-        responder = await asyncio.wait_for(anext(server.listen_reliable()), 5.0)
+        responder = await asyncio.wait_for(anext(server.listen_reliable()), PATIENCE)
         responder.response.success, responder.response.message = responder.request.data, "theirs"
         responder.send()
         return answer, await asked
@@ -103,7 +104,7 @@ def test_topics_with_the_sdk(sdk_router: tuple[str, dict[str, Any]]) -> None:
         talker = sdk.ROS2Publisher("/from_them", STRING, DATA, **where)
         subscribed = ours.subscribe("/from_them", STRING, heard.append)
         published = ours.publisher("/from_us", STRING)
-        assert ours.wait_for(subscribed, 5.0) == "" == ours.wait_for(published.endpoint, 5.0)
+        assert ours.wait_for(subscribed, PATIENCE) == "" == ours.wait_for(published.endpoint, PATIENCE)
         # A publisher that has just been declared does not know its listeners yet.
         wait_until(lambda: published.put(ours.types.new(STRING, data="to them")) or got)
         talker.publish(data="to us")
