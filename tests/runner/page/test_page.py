@@ -67,7 +67,7 @@ def page(lamp: Lamp, chromium: Browser) -> Iterator[Page]:
 
 def asked(url: str, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, str]:
     """Status and text of an answer; ``path`` is below the server, not below the token."""
-    with closing(http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)) as connection:
+    with closing(http.client.HTTPConnection(urlsplit(url).netloc, timeout=200)) as connection:
         connection.request(method, path, body or None, headers)
         answer = connection.getresponse()
         return answer.status, answer.read().decode(errors="replace")
