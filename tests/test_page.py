@@ -27,6 +27,8 @@ def test_a_person_shows_a_scene_and_gets_it_back(tmp_path: Path, monkeypatch: py
         assert "runner call demonstrator restore name=breakfast ask=true" in listed
         edits(page)
         restores_and_stops(page)
+        assert "brunch" in runner("goals", "brunch", "--delete").communicate(timeout=60)[0]
+        expect(page.get_by_role("heading", name="brunch")).to_have_count(0)
         tells_it_in_german(page)
     assert "COMPLETE" in run().output
 
@@ -109,6 +111,7 @@ def teaches(page: Page) -> None:
         *("tray", "cup", "tea box", "tuna can", "milk carton", "sugar box")
     }
     expect(page.get_by_role("region", name="What is there").get_by_role("listitem")).to_have_count(6)
+    expect(page.get_by_role("img", name="What stands on, in and next to what").locator("rect")).to_have_count(7)
     assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth === 640)")
     assert faults(page) == []
 

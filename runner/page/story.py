@@ -80,6 +80,19 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
+class Tie:
+    """An edge of the scene's graph: something is carried by another thing, or is beside it."""
+
+    kind: Literal["carried", "beside"]
+    how: str
+    """In words, for example "on"."""
+    other: str
+    """What another statement is about; what no statement is about carries everything."""
+    label: str
+    """The name of the other."""
+
+
+@dataclass(frozen=True, slots=True)
 class Statement:
     """One sentence about the scene; ``about`` names an outline, or is empty."""
 
@@ -87,6 +100,10 @@ class Statement:
     about: str = ""
     surety: Surety = "sure"
     how_sure: str = ""
+    label: str = ""
+    """The name of what it is about."""
+    ties: tuple[Tie, ...] = ()
+    """What the sentence says, as edges of a graph."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +128,9 @@ class Action:
     label: str
     arguments: dict[str, str]
     ask: Ask | None = None
-    kind: Literal["first", "plain", "stop"] = "plain"
-    """``first`` is what a person most likely wants next, ``stop`` is always in sight."""
+    kind: Literal["first", "plain", "stop", "delete"] = "plain"
+    """``first`` is what a person most likely wants next, ``stop`` is always in sight, ``delete`` ends what a card
+    shows."""
     now: bool = True
     """Whether it can be done now."""
     confirm: str = ""

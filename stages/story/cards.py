@@ -62,7 +62,8 @@ def _more(name: str, words: Words) -> Iterator[Action]:
     """What can be done with a goal on disk."""
     ask = Ask("to", words.say("new_name"), words.say("name_hint"), NAME)
     yield Action(GOALS, "rename", words.say("do_rename"), {"name": name}, ask)
-    yield Action(GOALS, "forget", words.say("do_forget"), {"name": name}, confirm=words.say("forget_sure", name=name))
+    sure = words.say("forget_sure", name=name)
+    yield Action(GOALS, "forget", words.say("do_forget"), {"name": name}, kind="delete", confirm=sure)
 
 
 def add(words: Words) -> Action:

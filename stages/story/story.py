@@ -25,6 +25,7 @@ from runner.page.story import (
     Place,
     Question,
     Statement,
+    Tie,
     Told,
     View,
 )
@@ -384,7 +385,11 @@ class Story:
             text = words.say(f"is_{how}", child=words.noun(name), supporter=words.noun(supporter))
             if name in beside:
                 text += words.say("beside", parents=words.nouns(beside[name]))
-            yield _statement(f"{text}.", name, judged.get(name), words)
+            ties = [Tie("carried", words.part(f"tie_{how}"), supporter, words.bare(supporter))]
+            for parent in beside.get(name, ()):
+                ties.append(Tie("beside", words.part("tie_beside"), parent, words.bare(parent)))
+            told = _statement(f"{text}.", name, judged.get(name), words)
+            yield replace(told, label=words.bare(name), ties=tuple(ties))
         for number, region in enumerate(self._estimate.unknown if self._estimate else ()):
             size = " x ".join(f"{100 * edge:.0f}" for edge in region.extent_table)
             text = words.say("unknown", size=size)

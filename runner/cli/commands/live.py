@@ -15,8 +15,11 @@ from runner.cli.completion import completed
 from runner.contract import Refused
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from runner.live.live import Live
-    from runner.page.story import Action
+    from runner.page.story import Action, Card
+    from runner.supervise.calls import CallRequest
 
 
 def add_commands(commands: Commands) -> None:
@@ -47,6 +50,7 @@ def add_commands(commands: Commands) -> None:
 
     goals = add(commands, "goals", _goals, "show what the running graph was taught, and what can be done with it")
     goals.add_argument("name", metavar="NAME", nargs="?", help="only this one")
+    goals.add_argument("--delete", action="store_true", help="delete it")
     text = "what this graph keeps on disk, whether it runs or not"
     goals.add_argument("--graph", metavar="GRAPH", type=Path, help=text)
     _add_run(goals)
@@ -142,7 +146,7 @@ def _topic_rate(options: argparse.Namespace) -> None:
 
 
 def _call(options: argparse.Namespace) -> int | None:
-    from runner.live.tables import commands_text, show_progress
+    from runner.live.tables import commands_text
     from runner.supervise.calls import CallRequest
 
     fields = _fields(options.fields)
@@ -150,10 +154,15 @@ def _call(options: argparse.Namespace) -> int | None:
         if options.name is None:
             print(commands_text(live.commands(), options.stage))
             return None
-        live.wait_until_ready(print)
-        request = CallRequest(options.stage, options.name, fields)
-        id = live.call(request)
-        return show_progress(id, options.stage, live.follow(id))
+        return _called(live, CallRequest(options.stage, options.name, fields))
+
+
+def _called(live: Live, request: CallRequest) -> int | None:
+    from runner.live.tables import show_progress
+
+    live.wait_until_ready(print)
+    id = live.call(request)
+    return show_progress(id, request.stage, live.follow(id))
 
 
 def _fields(texts: list[str]) -> dict[str, str]:
@@ -173,7 +182,7 @@ def _restart(options: argparse.Namespace) -> None:
         print(live.restart(options.process))
 
 
-def _goals(options: argparse.Namespace) -> None:
+def _goals(options: argparse.Namespace) -> int | None:
     from runner.graph.document import suggest
     from runner.graph.graph import load_graph
     from runner.page.watch import told_so_far, told_without_a_run
@@ -186,12 +195,28 @@ def _goals(options: argparse.Namespace) -> None:
     titles = [card.title for card in told.cards]
     if options.name is not None and options.name not in titles:
         raise Refused(f"{options.name}: is not remembered{suggest(options.name, titles)}")
+    if options.delete:
+        return _delete(options, told.cards)
     for card in told.cards:
         if options.name in (None, card.title):
             calls = (_typed(one) for one in (*card.actions, *card.more))
             print(card.title, *(f"    {line}" for line in (card.text, *calls)), sep="\n")
     if not told.cards:
         print(told.cards_hint or "this graph remembers nothing")
+    return None
+
+
+def _delete(options: argparse.Namespace, cards: Iterable[Card]) -> int | None:
+    from runner.supervise.calls import CallRequest
+
+    if options.name is None or options.graph is not None:
+        raise Refused("runner goals --delete: name one of a graph that runs")
+    actions = (action for card in cards if card.title == options.name for action in card.more)
+    delete = next((action for action in actions if action.kind == "delete"), None)
+    if delete is None:
+        raise Refused(f"{options.name}: cannot be deleted")
+    with _reached(options) as live:
+        return _called(live, CallRequest(delete.stage, delete.command, delete.arguments))
 
 
 def _typed(action: Action) -> str:

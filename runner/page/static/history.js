@@ -40,7 +40,7 @@ export async function replay(page, name, message) {
     page.past[answer.ok ? "moments" : "refused"] = await (answer.ok ? answer.json() : answer.text());
   }
   const found = page.past.moments?.findIndex((moment) => moment.message === message) ?? -1;
-  if (found >= 0) page.past.at = found;
+  if (found >= 0) Object.assign(page.past, {at: found, playing: false});
   page.past.at = Math.min(page.past.at, Math.max(0, (page.past.moments?.length ?? 1) - 1));
   page.draw();
 }

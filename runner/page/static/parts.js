@@ -56,7 +56,7 @@ export function solid(page, holder, recording) {
   const drawing = new URL(`runs/${recording}.rrd`, location.href).href.split("#")[0];
   return html`<section class="solid" aria-label=${page.say("solid")}>
     <button aria-expanded=${holder.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
-    ${holder.solid ? html`<iframe title=${page.say("solid")}
+    ${holder.solid ? html`<p class="quiet">${page.say("solid_hint")}</p><iframe title=${page.say("solid")}
       src="viewer/index.html?hide_welcome_screen&persist=0&url=${encodeURIComponent(drawing)}"></iframe>` : nothing}
   </section>`;
 }

@@ -1,6 +1,7 @@
 // For the person who shows the scene: what is seen, what goes on, what can be done.
 
 import {html, nothing, svg} from "./lit-html.js";
+import {graph} from "./graph.js";
 import {map} from "./map.js";
 import {button, lasted, solid} from "./parts.js";
 
@@ -87,7 +88,8 @@ export function statements(page, told) {
         <span>${one.text}</span>
         ${one.how_sure ? html`<span class="sure ${one.surety}"><b aria-hidden="true">${SIGNS[one.surety]}</b>
           ${one.how_sure}</span>` : nothing}
-      </li>`)}</ul></section>`;
+      </li>`)}</ul>
+    ${graph(page, told.statements)}</section>`;
 }
 
 function doing(page, told) {

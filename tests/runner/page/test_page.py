@@ -294,10 +294,12 @@ def test_the_texts_of_both_languages_are_the_same_ones() -> None:
 
 
 def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) -> None:
-    for _ in range(2):
+    blinked = re.compile(r"has blinked (\d+) times")
+    (before,) = blinked.findall(page.get_by_text("has blinked").inner_text())
+    for more in (1, 2):
         page.get_by_label("How often").fill("1")
         page.keyboard.press("Enter")
-    blinked = re.compile(r"has blinked (\d+) times")
+        expect(page.get_by_text("has blinked")).to_have_text(re.compile(rf"has blinked {int(before) + more} times"))
     page.get_by_role("link", name="History").click()
     page.get_by_role("link", name="Replay").click()
     then, slider = page.get_by_role("region", name="Then"), page.get_by_label("Moment")
@@ -313,7 +315,7 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     expect(slider).to_have_attribute("aria-valuetext", re.compile(rf"\d s: has blinked {first} times"))
     assert faults(page) == []
     page.get_by_role("button", name="Play").press("Enter")
-    expect(then).to_contain_text(second)
+    expect(then).to_contain_text(f"has blinked {int(before) + 2} times")
     run = page.url.rpartition("/")[2]
     page.goto(f"{page.url.partition('#')[0]}#history/{run}/lamp.blinked#1")
     expect(then).to_contain_text("runner why lamp.blinked#1")
@@ -353,6 +355,8 @@ def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
         "A lump: is not remembered; did you mean 'A lamp'? valid: A lamp\n",
         2,
     )
+    kept = runner("goals", "A lamp", "--delete")
+    assert (kept.communicate(timeout=60)[0], kept.returncode) == ("A lamp: cannot be deleted\n", 2)
 
 
 # ------------------------------------------------------------------------------------------ beginning and end
