@@ -16,12 +16,14 @@ from mcap.reader import make_reader
 from runner.cli.main import main
 from runner.contract import Refused
 from runner.message.codec import Step, envelope, pack
+from runner.recording.container import is_being_written
 from runner.recording.recording import Recording
 from runner.recording.recover import recover
 from runner.supervise.supervisor import EXIT_INCOMPLETE
 from tests.runner.common.recordings import record_toys, rewrite
 from tests.runner.common.runs import DOUBLES, processes_of, start
 from tests.runner.common.toys import Number
+from tests.runner.common.waiting import wait_until
 from tests.runner.process.test_recorder import Session
 
 LOST_NS = 500_000_000
@@ -223,9 +225,9 @@ def test_a_graph_killed_at_any_moment_leaves_a_recording(
         kill(process)
         process.communicate(timeout=60)
         assert process.returncode != 0
-        while processes_of(folder):
-            time.sleep(0.05)
         (path,) = folder.glob("*.mcap")
+        with path.open("rb") as file:  # which a process that dies lets go of last
+            wait_until(lambda file=file, folder=folder: not (processes_of(folder) or is_being_written(file)))
         lost.append(lost_ns(path, "counter/number", killed))
         for command in reading(path):
             assert main(command) in (0, 1), command
