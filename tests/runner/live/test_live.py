@@ -397,6 +397,7 @@ def test_a_topic_is_measured_by_headers_and_shown_without_its_type(account: Run)
 
 
 def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it, as would the tool
     tool = subprocess.Popen(
         [sys.executable, "-m", "runner.cli", "topic", "echo", "counter/number"], stdout=subprocess.PIPE, text=True
     )
@@ -409,7 +410,7 @@ def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
         assert live.status().published != seen
     tool.send_signal(signal.SIGCONT)
     tool.send_signal(signal.SIGINT)
-    tool.communicate(timeout=60)  # reads as well: who waits at a full pipe cannot end
+    tool.communicate(timeout=60)
     assert tool.returncode == 130
 
 
