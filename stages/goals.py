@@ -9,9 +9,10 @@ import cv2
 import msgspec
 
 from runner.contract import Context, Refused, Stage
-from stages.messages import Add, Forget, Frame, Goal, Kept, Loosen, Rename, SceneGraph, Strike
+from stages.messages import Add, Face, Forget, Frame, Goal, Kept, Loosen, Rename, SceneGraph, Strike
 from stages.messages.arrays import Rgb
 from stages.planning.pddl import goal_pddl
+from stages.scene.facing import faced
 from stages.scene.goals import GoalFolder, check_name, default_folder, loosened, unpacked, without
 
 QUALITY = 85
@@ -74,6 +75,11 @@ class Goals(Stage):
         """Has something count as next to the other further from where it was shown."""
         goal = self._goal(loosen.name)
         return self._write(_changed(goal.name, goal, loosened(goal.scene, loosen.region, loosen.radius)), ctx)
+
+    def on_face(self, face: Face, ctx: Context) -> Kept:
+        """Has the side matter that an object shows, or not any more."""
+        goal = self._goal(face.name)
+        return self._write(_changed(goal.name, goal, faced(goal.scene, face.object, face.side)), ctx)
 
     def on_add(self, add: Add, ctx: Context) -> Kept:
         """Keeps a goal that was exported."""

@@ -24,6 +24,7 @@ from stages.planning.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
+from stages.scene.facing import sides
 from stages.scene.stance import Stances, Standing
 from stages.scene.virtual import rerooted, satisfied
 
@@ -171,6 +172,7 @@ class Planner(Stage):
             task.goal,
             held=frozenset(child for region, child in inside if region in regions),
             graspable=frozenset(item.name for item in task.current.objects if not self._why_not(item.label)),
+            turned=frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"},
         )
 
     def _why_not(self, label: str) -> str:
@@ -200,6 +202,8 @@ class Planner(Stage):
                 raise Impossible(f"{item} would have to move from {support} to {wanted}, but it {why}")
             if item in problem.regions and item not in problem.held:
                 raise Impossible(f"{item} would have to move beside {problem.regions[item].parent}, but it {why}")
+            if item in problem.turned:
+                raise Impossible(f"{item} would have to be turned, but it {why}")
             if support in problem.clear or problem.goal.get(support, TABLE) != problem.supports.get(support, TABLE):
                 raise Impossible(f"{item} on {support} would have to move, but it {why}")
 
@@ -220,9 +224,11 @@ class Planner(Stage):
     def _solve(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
         current = Scene.of(task.current, self._stances)
-        handling = self._handling(self._robot, self._robot.table, ctx.rng)
+        handling = self._handling(self._robot, self._robot.table, ctx.rng, problem.faced)
         placements = Placements(task.goal, self._stances, taught)
-        targets = Targets(placements, self._config.workspace, self._robot, handling, wanted(task.goal))
+        # What may be anywhere is turned on the table.
+        goal = dict.fromkeys(problem.faced, TABLE) | wanted(task.goal)
+        targets = Targets(placements, self._config.workspace, self._robot, handling, goal)
         avoided = frozenset(task.avoid)
         blocked: Blocked | None = None
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
@@ -261,6 +267,7 @@ def _transfer(step: Step, T_base_targets: Floats, problem: Problem) -> Transfer:
         T_base_targets=T_base_targets,
         pick=pick,
         place=place,
+        faces=step.item in problem.faced,
     )
 
 

@@ -57,7 +57,7 @@ class SceneGraphBuilder(Stage):
         regions = virtual.virtual_objects(standing, supports, gap=self._config.gap, radius=self._config.radius)
         T_base_camera = scene_estimate.T_base_camera if scene_estimate.T_base_camera is not None else T_table_camera
         return SceneGraph(
-            objects=_objects(found, T_base_camera),
+            objects=self._objects(found, T_base_camera),
             virtual_objects=regions,
             assertions=(*relations.assertions(supports), *virtual.assertions(regions)),
             T_base_table=T_base_camera @ scene_estimate.T_camera_table,
@@ -76,9 +76,13 @@ class SceneGraphBuilder(Stage):
             raise Refused(f"scene_graph: object {label!r} is not in {self._config.catalogue}; known: {known}")
         return self._stances[label]
 
-
-def _objects(found: Sequence[ObjectPose], T_base_camera: Floats) -> tuple[SceneObject, ...]:
-    return tuple(
-        SceneObject(name=item.name, label=item.label, T_base_object=T_base_camera @ item.T_camera_object)
-        for item in found
-    )
+    def _objects(self, found: Sequence[ObjectPose], T_base_camera: Floats) -> tuple[SceneObject, ...]:
+        return tuple(
+            SceneObject(
+                name=item.name,
+                label=item.label,
+                T_base_object=T_base_camera @ item.T_camera_object,
+                facing=1.0 if len(self._catalogue[item.label].symmetries.transforms()) == 1 else item.facing,
+            )
+            for item in found
+        )

@@ -95,6 +95,10 @@ def edits(page: Page) -> None:
     page.locator(".cards summary").first.press("Enter")
     page.get_by_role("button", name="Leave the sugar box out").press("Enter")
     expect(page.locator(".cards")).to_contain_text("5 objects: ")
+    turned = page.locator(".lines li").filter(has_text="The milk carton may show any side.")
+    turned.get_by_label("Label or handle").select_option("half a turn")
+    turned.get_by_role("button", name="Choose").press("Enter")
+    expect(page.get_by_text("The milk carton shows the side opposite to the one in the picture.")).to_be_visible()
     page.get_by_text("More").first.press("Enter")
     page.get_by_label("New name").fill("brunch")
     page.keyboard.press("Enter")
@@ -126,8 +130,9 @@ def restores_and_stops(page: Page) -> None:
     expect(page.locator(".arrow")).not_to_have_count(0)
     assert faults(page) == []
     page.get_by_role("button", name="Go", exact=True).press("Enter")
-    expect(page.locator(".what")).to_have_text("Puts the cup on the table")
-    expect(page.get_by_text(re.compile(r"^Step 1 of \d"))).to_be_visible()
+    for number, name in enumerate(("milk carton", "cup"), 1):
+        expect(page.locator(".what")).to_have_text(f"Puts the {name} on the table")
+        expect(page.get_by_text(re.compile(rf"^Step {number} of 2"))).to_be_visible()
     expect(page.get_by_role("button", name="Restore")).to_be_disabled()
     page.keyboard.press("Escape")
     expect(page.get_by_text(re.compile(r"^Stopped, as you asked"))).to_be_visible()

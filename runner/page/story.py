@@ -115,8 +115,12 @@ class Ask:
     hint: str = ""
     pattern: str = ""
     """Regular expression that the whole text must match; anything by default."""
-    kind: Literal["text", "file"] = "text"
+    kind: Literal["text", "file", "choice"] = "text"
     """A file is sent as base64."""
+    choices: tuple[tuple[str, str], ...] = ()
+    """What can be chosen, and how it is told."""
+    chosen: str = ""
+    """The one of them that holds now."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,25 +40,32 @@ SCREENSHOT_SECONDS = 120
 # ------------------------------------------------------------------------------------ recordings
 
 
-def view_recording(path: Path, *, save: Path | None = None, png: Path | None = None) -> None:
-    """Opens a viewer on a recording, or writes it as a Rerun file or a picture of its last state."""
+def view_recording(path: Path, *, at: str | None = None, save: Path | None = None, png: Path | None = None) -> None:
+    """Opens a viewer on a recording, or writes it as a Rerun file or a picture of its last state.
+
+    ``at`` is the message that is the last to be shown; raises Refused where it is not recorded.
+    """
     recording = Recording(path)
+    if at is not None:
+        recording.require(at)
     with tempfile.TemporaryDirectory() as folder:
         rrd = save or Path(folder) / f"{path.stem}.rrd"
-        save_rrd(recording, rrd)
+        save_rrd(recording, rrd, at)
         if png is not None:
             screenshot(rrd, png)
         if save is None and png is None:
             _wait(_start_viewer(_free_port(), str(rrd)))
 
 
-def save_rrd(recording: Recording, target: Path) -> None:
-    """Draws a whole recording into a Rerun file, ``-`` for stdout."""
+def save_rrd(recording: Recording, target: Path, at: str | None = None) -> None:
+    """Draws a recording, whole or until a message, into a Rerun file, ``-`` for stdout."""
     stream = _stream(recording.path)
     canvas = Canvas(recording.run["graph"], recording.path, stream)
     _write(stream, target)
     for sealed in recording.envelopes():
         canvas.draw(sealed)
+        if sealed.id == at:
+            break
     stream.flush()
     stream.disconnect()
 

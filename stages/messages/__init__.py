@@ -9,7 +9,7 @@ the support plane (z up, z = 0 on the surface), ``object`` as the catalogue defi
 from stages.messages.arrays import Box, Depth, Intrinsics, Mask, Points, Pose, Poses, Rgb, Vector
 from stages.messages.correction import Arrived, Calibrate, Correction, PostureRequest
 from stages.messages.digest import Candidate, Candidates, Hypothesis, Observation, Posterior, SceneEstimate
-from stages.messages.goals import Add, Forget, Kept, Loosen, Rename, Strike
+from stages.messages.goals import Add, Face, Forget, Kept, Loosen, Rename, Strike
 from stages.messages.hand_eye import Abort, CalibrateCamera, CameraCalibration, Mounting
 from stages.messages.robot import Brake, RobotCommand, RobotState
 from stages.messages.ros2 import Asked, Ros2Heard, Ros2Message, Ros2Sent
@@ -56,6 +56,7 @@ __all__ = [
     "Candidates",
     "Correction",
     "Depth",
+    "Face",
     "Forget",
     "Frame",
     "Go",

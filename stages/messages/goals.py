@@ -1,5 +1,7 @@
 """Goals that are kept on disk, and what people ask of them."""
 
+from typing import Literal
+
 from runner.contract import Command, Message
 from stages.messages.task import Goal
 
@@ -52,6 +54,20 @@ class Loosen(Command, frozen=True, kw_only=True):
     """Of the goal, for example cup_near_tray."""
     radius: float
     """Metres."""
+
+
+class Face(Command, frozen=True, kw_only=True):
+    """Says which side an object of a goal has to show."""
+
+    answers = (Kept,)
+
+    name: str
+    """Of a goal that is kept."""
+    object: str
+    """Of the goal; the picture must tell its sides apart."""
+    side: Literal["any", "shown", "left", "back", "right"]
+    """``any`` for whichever; as it was shown; or turned from that: a quarter to the left, half, a quarter to the
+    right, seen from above."""
 
 
 class Add(Command, frozen=True, kw_only=True):

@@ -5,7 +5,9 @@ from typing import Literal
 from runner.contract import Message, Struct
 from stages.messages.arrays import Box, Intrinsics, Matrix, Pose, Vector
 
-Predicate = Literal["exist", "clear", "on", "in", "has"]
+Predicate = Literal["exist", "clear", "on", "in", "has", "faces"]
+Side = Literal["shown", "left", "back", "right"]
+"""As an object was shown, or turned from that: a quarter to the left, half, a quarter to the right; seen from above."""
 Stance = Literal["upright", "upside down", "lying"]
 
 
@@ -74,7 +76,10 @@ class VirtualObject(Struct, frozen=True, kw_only=True):
 
 
 class Assertion(Struct, frozen=True, kw_only=True):
-    """One axiom of the scene, for example ``on(clorox, lipton)``. The support plane is ``table``."""
+    """One axiom of the scene, for example ``on(clorox, lipton)``. The support plane is ``table``.
+
+    ``faces(clorox, shown)`` is said in goals alone, where somebody chose a :data:`Side`.
+    """
 
     predicate: Predicate
     arguments: tuple[str, ...]
@@ -90,6 +95,9 @@ class SceneObject(Struct, frozen=True, kw_only=True):
     label: str
     T_base_object: Pose
     """In the scene's :attr:`SceneGraph.frame`."""
+    facing: float | None = None
+    """How likely the object also shows the side that the pose says, as :attr:`ObjectPose.facing`, and 1 where its shape
+    has no symmetry; None where nobody looked."""
 
 
 class Doubt(Struct, frozen=True, kw_only=True):

@@ -59,6 +59,9 @@ class Transfer(Struct, frozen=True, kw_only=True):
     pick: str
     """The symbolic action, for example ``(pick cup table)``."""
     place: str
+    faces: bool = False
+    """Whether the object has to show the side that the poses say; else poses that differ by a symmetry of its shape
+    would do as well."""
 
     @property
     def key(self) -> str:

@@ -23,8 +23,11 @@ _QUARTER = 0.1
 class Handling:
     """Grasps, postures and straight motions of single steps, with the least margins that a transfer is done with."""
 
-    def __init__(self, robot: Robot, table: Table, rng: np.random.Generator) -> None:
-        self._robot, self._table, self._rng = robot, table, rng
+    def __init__(
+        self, robot: Robot, table: Table, rng: np.random.Generator, faced: frozenset[str] = frozenset()
+    ) -> None:
+        """``faced``: objects that have to show the side that their targets say."""
+        self._robot, self._table, self._rng, self._faced = robot, table, rng, faced
 
     def of(self, step: Step, scene: Scene, places: Sequence[Standing]) -> Handled:
         """A step of a plan, with the places that its object may go to, best first."""
@@ -34,7 +37,8 @@ class Handling:
         table = replace(self._table, height=float(scene.T_base_table[2, 3]))
         world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=MARGINS[-1].clearance)
         targets = np.stack([scene.T_base_table @ place.T_table_object for place in places])
-        errand = Errand(*objects[step.item], targets, step.source, step.destination)
+        faces = step.item in self._faced
+        errand = Errand(*objects[step.item], targets, step.source, step.destination, faces)
         return Handled(PickPlacePlanner(world, errand, self._rng, room=MARGINS[-1].room), self._robot, places)
 
 

@@ -35,6 +35,7 @@ DOMAIN = """\
     (roomy ?s - support)                          ; may carry several items; geometry says whether one more fits
     (may-rest ?i - item ?s - support)             ; worth trying
     (belongs ?i - item ?r - region)
+    (turned ?i - item)                            ; it shows another side than the goal has; placed, it shows that one
     (obstructs ?o - item ?i - item ?t - thing))   ; it stands where the item would come on the support or in the region
 
   (:action pick
@@ -42,6 +43,7 @@ DOMAIN = """\
     :precondition (and (handempty) (exist ?i) (graspable ?i) (clear ?i) (on ?i ?s))
     :effect (and (holding ?i) (not (handempty)) (not (on ?i ?s))
       (when (forall (?o - item) (or (= ?o ?i) (not (on ?o ?s)))) (clear ?s))
+      (not (turned ?i))
       (forall (?l - label) (not (at ?i ?l)))
       (forall (?r - region) (not (in ?r ?i)))
       (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
@@ -52,6 +54,7 @@ DOMAIN = """\
     :precondition (and (handempty) (exist ?i) (graspable ?i) (clear ?i) (in ?i ?s))
     :effect (and (holding ?i) (not (handempty)) (not (in ?i ?s))
       (when (forall (?o - item) (or (= ?o ?i) (not (in ?o ?s)))) (clear ?s))
+      (not (turned ?i))
       (forall (?l - label) (not (at ?i ?l)))
       (forall (?r - region) (not (in ?r ?i)))
       (forall (?r - region ?c - item) (when (has ?i ?r) (not (in ?r ?c))))
@@ -157,6 +160,7 @@ def _init(problem: Problem, goal: SceneGraph) -> list[str]:
         *(fact("has", region.parent, region.name) for region in regions),
         *(fact("belongs", region.child, region.name) for region in regions),
         *(fact("in", region.name, region.child) for region in regions if region.child in problem.held),
+        *(fact("turned", item) for item in sorted(problem.turned)),
         *(fact("obstructs", *names) for names in sorted(problem.obstructions)),
     ]
 
@@ -166,4 +170,5 @@ def _goal(problem: Problem) -> list[str]:
         *(fact("in" if s in problem.concave else "on", item, s) for item, s in problem.goal.items()),
         *(fact("clear", item) for item in sorted(problem.clear)),
         *(fact("in", region.name, region.child) for region in problem.regions.values()),
+        *(f"(not {fact('turned', item)})" for item in sorted(problem.faced)),
     ]

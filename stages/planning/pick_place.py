@@ -94,6 +94,8 @@ class Errand:
     """N x 4 x 4, best first."""
     source: str
     destination: str
+    faces: bool = False
+    """Whether the targets also say which side is shown; symmetries of the shape do not count then."""
 
 
 def opening(world: CollisionWorld, grasp: Grasp, room: float) -> float:
@@ -108,7 +110,8 @@ class PickPlacePlanner:
         """``room``: see :class:`Margins`."""
         self._world, self._errand, self._rng, self._room = world, errand, rng, room
         self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
-        self._grasps = distinct_grasps(errand.entry)
+        self._entry = errand.entry.without_symmetries() if errand.faces else errand.entry
+        self._grasps = distinct_grasps(self._entry)
         self._first_picks: dict[str, Pick | None] = {}
 
     def plans(self, start: Floats) -> Iterator[PickPlace]:
@@ -176,7 +179,7 @@ class PickPlacePlanner:
         return None
 
     def _hands(self, grasp: Grasp, T_base_object: Floats) -> list[HandPose]:
-        return hand_poses(self._errand.entry, grasp, T_base_object)
+        return hand_poses(self._entry, grasp, T_base_object)
 
     def _connected(self, pairs: Iterable[tuple[Pick, Place]], start: Floats) -> Iterator[PickPlace]:
         """Joins picks and places by motions in joint space."""
@@ -290,7 +293,9 @@ def planners(
     ``objects``: by name, with T_base_object.
     """
     entry, T_base_object = objects[transfer.object]
-    errand = Errand(entry, T_base_object, transfer.T_base_targets, transfer.source, transfer.destination)
+    errand = Errand(
+        entry, T_base_object, transfer.T_base_targets, transfer.source, transfer.destination, transfer.faces
+    )
     for margins in MARGINS:
         world = CollisionWorld(robot, table, objects, carried=transfer.object, clearance=margins.clearance)
         yield world, PickPlacePlanner(world, errand, rng, room=margins.room)

@@ -15,6 +15,7 @@ from stages.messages.scene import SceneGraph
 from stages.planning.problem import TABLE, carriers
 from stages.planning.search import Step
 from stages.scene.catalogue import CatalogueObject
+from stages.scene.facing import sides, turned_to
 from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed
 from stages.scene.virtual import in_region, region_poses
 
@@ -97,6 +98,7 @@ class Placements:
         self._poses = {item.name: item.T_base_object for item in goal.objects}
         self._virtual = {item.name: item for item in goal.virtual_objects}
         self._stances = stances
+        self._sides = sides(goal)
 
     def of(self, step: Step, scene: Scene) -> list[Placement]:
         """All placements of a step of the goal, in the table frame; their height is still to be found."""
@@ -109,13 +111,21 @@ class Placements:
         made: list[Placement] = []
         for k, T in enumerate(nominal):
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
-            for turned, cost in _orientations(T, item):
+            for turned, cost in self._orientations(T, item, scene):
                 base = Standing.at(step.item, stances, turned)
                 for shift in shifts if k == 0 and cost < TURNED else shifts[:13]:
                     standing = _shifted(base, shift)
                     if self._as_taught(step, standing, scene):
                         made.append(Placement(standing, away + cost + float(np.hypot(*shift))))
         return sorted(made, key=lambda placement: placement.cost)
+
+    def _orientations(self, T: Floats, item: Standing, scene: Scene) -> list[tuple[Floats, float]]:
+        """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it."""
+        if item.name not in self._sides:
+            return _orientations(T, item)
+        faced = inverse(scene.T_base_table) @ turned_to(self._poses[item.name], self._sides[item.name])
+        faced[:3, 3] = T[:3, 3]
+        return [(faced, 0.0)]
 
     def _as_taught(self, step: Step, item: Standing, scene: Scene) -> bool:
         """Whether what the goal has beside this object is so, where that is told the other way round."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from stages.messages.scene import SceneGraph
+from stages.scene.facing import sides
 
 TABLE = "table"
 
@@ -39,11 +40,22 @@ class Problem:
     """Child -> the region in which it belongs."""
     held: frozenset[str]
     """Children that are in their region now."""
+    faced: frozenset[str] = frozenset()
+    """Items of which the goal says which side they show."""
+    turned: frozenset[str] = frozenset()
+    """Those of them that show another one now, or may do so."""
     obstructions: frozenset[tuple[str, str, str]] = frozenset()
     """(obstacle, item, support or region): the obstacle must have been picked before the item is placed there."""
 
     @staticmethod
-    def between(current: SceneGraph, goal: SceneGraph, *, held: frozenset[str], graspable: frozenset[str]) -> Problem:
+    def between(
+        current: SceneGraph,
+        goal: SceneGraph,
+        *,
+        held: frozenset[str],
+        graspable: frozenset[str],
+        turned: frozenset[str] = frozenset(),
+    ) -> Problem:
         """The problem of turning one scene into another that has at least the goal's objects."""
         return Problem(
             supports=carriers(current),
@@ -53,6 +65,8 @@ class Problem:
             graspable=graspable,
             regions={item.child: Region(item.name, item.parent, item.child) for item in goal.virtual_objects},
             held=held,
+            faced=frozenset(sides(goal)),
+            turned=turned,
         )
 
     @property
@@ -88,7 +102,7 @@ class Problem:
         """Whether the goal holds already."""
         occupied = set(self.supports.values())
         placed = all(self.supports[item] == support for item, support in self.goal.items())
-        return placed and not self.clear & occupied and self.held >= set(self.regions)
+        return placed and not self.clear & occupied and self.held >= set(self.regions) and not self.turned
 
 
 def carriers(scene: SceneGraph) -> dict[str, str]:

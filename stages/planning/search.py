@@ -12,8 +12,8 @@ from stages.planning.problem import TABLE, Problem
 
 BFS = "bfs"
 """The engine that is always there: :func:`breadth_first`."""
-State = tuple[tuple[str, ...], frozenset[str], frozenset[tuple[str, str, str]]]
-"""Support of each item, children in their region, obstructions that remain."""
+State = tuple[tuple[str, ...], frozenset[str], frozenset[tuple[str, str, str]], frozenset[str]]
+"""Support of each item, children in their region, obstructions that remain, items that show the wrong side."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def breadth_first(problem: Problem, *, reluctant: Collection[str] = ()) -> Solut
     now is in nobody's way.
     """
     order = sorted(problem.items, key=lambda item: item in reluctant)
-    start: State = (tuple(problem.supports.values()), problem.held, problem.obstructions)
+    start: State = (tuple(problem.supports.values()), problem.held, problem.obstructions, problem.turned)
     search = _Search(problem, tuple(order))
     parents: dict[State, tuple[State, Step] | None] = {start: None}
     frontier, expanded = [start], 0
@@ -90,10 +90,10 @@ class _Search:
 
     def reached(self, state: State) -> bool:
         """Whether the goal holds."""
-        supports, held, _ = state
+        supports, held, _, turned = state
         problem = self._problem
         placed = all(supports[self._index[item]] == support for item, support in problem.goal.items())
-        return placed and held >= problem.regions.keys() and problem.clear.isdisjoint(supports)
+        return placed and held >= problem.regions.keys() and problem.clear.isdisjoint(supports) and not turned
 
     def moves(self, state: State) -> list[tuple[Step, State]]:
         """The moves worth following: the first that is final, or else all."""
@@ -108,10 +108,11 @@ class _Search:
         return found
 
     def _moves_of(self, item: str, state: State) -> Iterator[tuple[Step, State]]:
-        supports, held, obstructions = state
+        supports, held, obstructions, turned = state
         at, regions = self._index[item], self._problem.regions
         held -= {child for child in held if child == item or regions[child].parent == item}
         obstructions = frozenset(entry for entry in obstructions if entry[0] != item)
+        turned -= {item}
         lifted = (*supports[:at], "", *supports[at + 1 :])
         for destination in self._problem.destinations(item):
             if destination not in self._roomy and destination in lifted:
@@ -123,8 +124,8 @@ class _Search:
                 entry[1:] == (item, regions[item].name) for entry in obstructions
             ):
                 step = Step(item, supports[at], destination, regions[item].name, regions[item].parent)
-                yield step, (placed, held | {item}, obstructions)
-            yield Step(item, supports[at], destination), (placed, held, obstructions)
+                yield step, (placed, held | {item}, obstructions, turned)
+            yield Step(item, supports[at], destination), (placed, held, obstructions, turned)
 
     def _region_on(self, item: str, destination: str, supports: tuple[str, ...]) -> bool:
         """Whether the item's region is on this support: where the goal has it, if the region's parent is there."""
@@ -134,12 +135,12 @@ class _Search:
 
     def _settled(self, item: str, state: State) -> bool:
         """Whether an item is where it belongs and nothing below or beside it will have to move."""
-        supports, held, obstructions = state
+        supports, held, obstructions, turned = state
         if item == TABLE:
             return True
         if supports[self._index[item]] != self._problem.goal.get(item):
             return False
-        if any(entry[0] == item for entry in obstructions):
+        if item in turned or any(entry[0] == item for entry in obstructions):
             return False
         region = self._problem.regions.get(item)
         beside = region is None or (item in held and self._settled(region.parent, state))

@@ -166,7 +166,7 @@ def _truth(judgement: Judgement) -> list[str]:
 def _reading_order(marked: tuple[Assertion, str]) -> tuple[bool, int]:
     """What is violated first, then what says the most."""
     assertion, mark = marked
-    return mark == "✓", ("on", "in", "has", "clear", "exist").index(assertion.predicate)
+    return mark == "✓", ("on", "in", "faces", "has", "clear", "exist").index(assertion.predicate)
 
 
 def _perception(looks: Sequence[Look]) -> list[str]:

@@ -141,7 +141,7 @@ def without(scene: SceneGraph, what: str) -> SceneGraph:
     if region := next((name for name in found[0].arguments if name in regions), None):
         return _without(scene, {region})
     rest = msgspec.structs.replace(scene, assertions=tuple(item for item in scene.assertions if item not in found))
-    if found[0].predicate == "clear":
+    if found[0].predicate in ("clear", "faces"):
         return rest
     return _without(rest, {name for name, item in regions.items() if item.child == found[0].arguments[0]})
 

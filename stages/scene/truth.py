@@ -118,7 +118,7 @@ class Truth:
         """The true scene graph; what left the table does not exist in it."""
         T_base_table = _table(snapshot, taught)
         objects = tuple(
-            SceneObject(name=name, label=label_of(name, self._catalogue), T_base_object=T)
+            SceneObject(name=name, label=label_of(name, self._catalogue), T_base_object=T, facing=1.0)
             for name, T in zip(snapshot.names, snapshot.T_base_objects, strict=True)
             if not _left(T, T_base_table)
         )
@@ -133,7 +133,9 @@ class Truth:
             _moved(item, poses) for item in taught.virtual_objects if {item.parent, item.child} <= set(poses)
         )
         names = {item.name for item in regions}
-        beside = tuple(item for item in taught.assertions if not names.isdisjoint(item.arguments))
+        beside = tuple(
+            item for item in taught.assertions if item.predicate == "faces" or not names.isdisjoint(item.arguments)
+        )
         return msgspec.structs.replace(scene, virtual_objects=regions, assertions=(*scene.assertions, *beside))
 
     def _losses(

@@ -11,6 +11,7 @@ from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages.scene import Assertion, SceneGraph, VirtualObject
+from stages.scene import facing
 from stages.scene.catalogue import Catalogue, Symmetries
 from stages.scene.relations import Support
 from stages.scene.stance import Standing
@@ -157,15 +158,15 @@ def satisfied(
     """The goal's assertions that hold in the current scene, and those that do not.
 
     Compares the topological layout (paper, section VI-B): exist, on, in and clear as the current scene asserts them;
-    has and in of a virtual object by the current poses, whatever virtual objects the current scene has. Poses and
-    objects that the goal does not name are not compared, except that these may not be on or in a goal object that
-    was clear.
+    has and in of a virtual object by the current poses, whatever virtual objects the current scene has, and faces by
+    the current poses. Poses and objects that the goal does not name are not compared, except that these may not be on
+    or in a goal object that was clear.
     """
     # Regions of the current scene may have the same names and mean other places.
     regions_now = {item.name for item in current.virtual_objects}
     real = (item for item in current.assertions if regions_now.isdisjoint(item.arguments))
     asserted = {(item.predicate, item.arguments) for item in real}
-    asserted |= _held_regions(goal, current, catalogue)
+    asserted |= _held_regions(goal, current, catalogue) | facing.held(goal, current)
     held = [item for item in goal.assertions if (item.predicate, item.arguments) in asserted]
     violated = [item for item in goal.assertions if (item.predicate, item.arguments) not in asserted]
     return tuple(held), tuple(violated)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from runner.page.story import Action, Ask, Card, File, Line, Photo
 from stages.messages import Assertion, Goal
+from stages.scene.facing import SIDES, is_told, sides
 from stages.scene.goals import MAX_RADIUS, packed
 from stages.story.words import Words
 
@@ -82,6 +83,7 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
     def strike(what: str, label: str) -> Action:
         return Action(GOALS, "strike", label, {"name": goal.name, "what": what})
 
+    chosen = sides(scene)
     for item in scene.objects:
         noun, found = words.noun(item.name), carried.get(item.name)
         text = words.say("anywhere", object=noun)
@@ -90,6 +92,9 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
         loose = () if found is None else (strike(str(found), words.say("do_strike")),)
         out = (strike(item.name, words.say("do_leave_out", object=noun)),) if len(scene.objects) > 1 else ()
         yield Line(f"{text}.", (*loose, *out))
+        if is_told(item):
+            side = chosen.get(item.name, "any")
+            yield Line(f"{words.say(f'faces_{side}', object=noun)}.", (_face(goal.name, item.name, side, words),))
     for region in scene.virtual_objects:
         parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
         text = words.say("is_beside", **parts, off=round(100 * region.radius))
@@ -97,6 +102,13 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
         wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
         loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
         yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+
+
+def _face(name: str, item: str, side: str, words: Words) -> Action:
+    """Lets people choose which side an object shows."""
+    choices = tuple((one, words.part(f"side_{one}")) for one in ("any", *SIDES))
+    ask = Ask("side", words.say("which_side"), kind="choice", choices=choices, chosen=side)
+    return Action(GOALS, "face", words.say("do_face"), {"name": name, "object": item}, ask)
 
 
 def _carries(item: Assertion) -> bool:

@@ -472,6 +472,9 @@ class Story:
             if item.predicate in ("on", "in") and item.arguments[0] not in virtual:
                 child, supporter = map(words.noun, item.arguments)
                 found.append(words.say(f"should_{item.predicate}", child=child, supporter=supporter))
+            elif item.predicate == "faces":
+                name, side = item.arguments
+                found.append(words.say("should_face", object=words.noun(name), side=words.part(f"side_{side}")))
             elif item.predicate == "in":
                 region = virtual[item.arguments[0]]
                 parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}

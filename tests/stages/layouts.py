@@ -81,6 +81,7 @@ class Layout:
                 confidence=0.9,
                 cost=0.1,
                 box=np.array([0.0, 0.0, 10.0, 10.0]),
+                facing=1.0,
             )
             for name, T in self.poses.items()
         )

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from runner.contract import Command, Refused
 from runner.message.codec import decode, encode
 from runner.supervise.calls import read_command
 from stages.goals import Goals
-from stages.messages import Add, Forget, Goal, Kept, Loosen, Rename, SceneGraph, Strike
+from stages.messages import Add, Face, Forget, Goal, Kept, Loosen, Rename, SceneGraph, Strike
 from stages.planning.pddl import goal_pddl
 from stages.planning.problem import Problem
 from stages.scene.catalogue import BUILT_IN, Catalogue
@@ -178,6 +179,22 @@ def test_next_to_is_loosened(tmp_path: Path) -> None:
         robot.called(Loosen(name="tea", region="cup", radius=0.08))
     with pytest.raises(Refused, match=r"radius=0.0: must be more than 0 and at most 0.5 metres"):
         robot.called(Loosen(name="tea", region="tea_box_near_tray", radius=0.0))
+
+
+def test_the_side_that_matters_is_chosen_and_kept(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.taught("tea")
+    with pytest.raises(Refused, match="object='tea_box': no object of the goal whose side can be told; valid: none"):
+        robot.called(Face(name="tea", object="tea_box", side="back"))
+    told = tuple(msgspec.structs.replace(item, facing=0.99) for item in TEA.objects)
+    robot.kept = robot.stage.on_goal(
+        Goal(name="tea", scene=msgspec.structs.replace(TEA, objects=told), pddl=""), robot.ctx
+    )
+    robot.called(Face(name="tea", object="tea_box", side="back"))
+    (again,) = Robot(tmp_path).kept.goals
+    assert facts(again.scene) == facts(TEA) | {"faces(tea_box, back)"} and "(not (turned tea_box))" in again.pddl
+    robot.called(Face(name="tea", object="tea_box", side="any"))
+    assert facts(robot.scene()) == facts(TEA)
 
 
 def test_what_is_not_in_a_goal_cannot_be_struck_out(tmp_path: Path) -> None:

@@ -13,9 +13,12 @@ from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
+from stages.messages.scene import Side
 from stages.planner import Planner
 from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
+from stages.scene.facing import SIDES, faced, turned_to
+from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
 from stages.scene.virtual import rerooted, satisfied
 from tests.stages.episodes import Recorded
@@ -114,6 +117,40 @@ def test_picks_and_places_are_paired():
     assert found.actions == tuple(action for t in found.transfers for action in (t.pick, t.place))
     assert "(pick bowl table)" in found.actions
     assert "(place-in bowl tray)" in found.actions
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_an_object_is_turned_to_the_side_that_the_goal_has(side: Side):
+    start = Layout().put("sugar_box", 0.0, 0.1).put("tea_box", 0.1, -0.2).put("soup_can", 0, 0, on="tea_box")
+    goal = faced(start.graph(), "tea_box", side)
+    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start.graph()), Recorded())
+    if side == "shown":
+        assert found.status == "satisfied"
+        return
+    assert [transfer.key for transfer in found.transfers] == [
+        *("soup_can: tea_box -> table", "tea_box: table -> table", "soup_can: table -> tea_box")
+    ]
+    assert [transfer.faces for transfer in found.transfers] == [False, True, False]
+    (shown,) = (item.T_base_object for item in start.graph().objects if item.name == "tea_box")
+    for T in found.transfers[1].T_base_targets:
+        assert np.allclose(T[:3, :3], turned_to(shown, side)[:3, :3], atol=1e-6)
+    for which in (0, 5):
+        assert not satisfied(goal, executed(start, found, which=which).graph(), catalogue())[1]
+
+
+def test_what_may_be_anywhere_is_turned_on_the_table():
+    start = Layout().put("tray", 0.1, 0.1).put("tea_box", 0.0, 0.0, on="tray")
+    goal = without(faced(start.graph(), "tea_box", "left"), "in(tea_box, tray)")
+    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start.graph()), Recorded())
+    assert [transfer.key for transfer in found.transfers] == ["tea_box: tray -> table"]
+    assert not satisfied(goal, executed(start, found).graph(), catalogue())[1]
+
+
+def test_what_cannot_be_grasped_cannot_be_turned():
+    start = Layout().put("tray", 0.1, 0.1)
+    goal = faced(start.graph(), "tray", "left")
+    found = planner().on_task(Task(goal_name="goal", goal=goal, current=start.graph()), Recorded())
+    assert found.reason == "tray would have to be turned, but it has no grasp in the catalogue"
 
 
 def test_table_level_goals_come_first_where_they_were_shown():

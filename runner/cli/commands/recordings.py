@@ -13,7 +13,9 @@ def add_commands(commands: Commands) -> None:
 
     view = add(commands, "view", _view, "show a recording, or a graph while it runs")
     view.add_argument("file", type=Path, metavar="FILE", nargs="?", help="a recording")
-    view.add_argument("--live", action="store_true", help="follow the run that is being recorded")
+    when = view.add_mutually_exclusive_group()
+    when.add_argument("--live", action="store_true", help="follow the run that is being recorded")
+    when.add_argument("--at", metavar="ID", help="nothing that came after a message, for example executor.outcome#2")
     view.add_argument("--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening the viewer")
     view.add_argument("--png", type=Path, metavar="PNG", help="write a picture instead of opening the viewer")
 
@@ -59,7 +61,7 @@ def _view(options: argparse.Namespace) -> None:
     elif options.file is None:
         raise Refused("runner view: name a recording, or --live")
     else:
-        view_recording(options.file, save=options.save, png=options.png)
+        view_recording(options.file, at=options.at, save=options.save, png=options.png)
 
 
 def _recover(options: argparse.Namespace) -> None:

@@ -1,7 +1,7 @@
 // The recordings beside the running one, and one of them told again.
 
 import {html, nothing} from "./lit-html.js";
-import {lasted, size, solid} from "./parts.js";
+import {engineers, lasted, size, solid} from "./parts.js";
 import {notice, question, statements, view} from "./scene.js";
 
 const WORDS = {COMPLETE: "complete", INCOMPLETE: "incomplete"};
@@ -33,11 +33,12 @@ function list(page) {
 /** Asks for a recording's moments, and shows the one that a message brought about, or the first. */
 export async function replay(page, name, message) {
   if (page.past?.name !== name || page.past.language !== page.language) {
-    page.past = {name, language: page.language, moments: null, at: page.past?.at ?? 0, refused: ""};
+    const past = {name, language: page.language, moments: null, at: page.past?.at ?? 0, refused: ""};
+    page.past = past;
     page.draw();
-    const answer = await fetch(`runs/${name}/${page.language}.json`);
-    if (page.past?.name !== name) return;
-    page.past[answer.ok ? "moments" : "refused"] = await (answer.ok ? answer.json() : answer.text());
+    const answer = await fetch(`runs/${name}/${past.language}.json`);
+    past[answer.ok ? "moments" : "refused"] = await (answer.ok ? answer.json() : answer.text());
+    if (page.past !== past) return; // something else was asked for meanwhile
   }
   const found = page.past.moments?.findIndex((moment) => moment.message === message) ?? -1;
   if (found >= 0) Object.assign(page.past, {at: found, playing: false});
@@ -70,7 +71,7 @@ function replayed(page, past) {
         >${one}</li>`)}</ol>` : nothing}
       ${question(page, moment.question && {...moment.question, answers: []})}
       ${notice(page, moment.notice, "")}
-      <p class="quiet">${page.say("ask_engineer")} <code>runner why ${moment.message} ${past.name}.mcap</code></p>
+      ${engineers(page, moment.message, past.name)}
     </section></div>
     ${statements(page, moment)}
     ${solid(page, past, past.name)}

@@ -15,7 +15,7 @@ export function button(page, action, {shortcut, about} = {}) {
     form.reset();
   };
   return html`<form class="action ${kind}" @submit=${send}>
-    ${action.ask ? field(action) : nothing}
+    ${action.ask ? field(action, about) : nothing}
     <button class=${kind} ?disabled=${!action.now || !page.ready}
       aria-keyshortcuts=${shortcut ?? nothing} aria-describedby=${about ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
       >${action.label}</button>
@@ -30,12 +30,21 @@ async function filled(value) {
   return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
 }
 
-function field({ask, command}) {
+function field({ask, command}, about) {
   const hint = `${command}-hint`;
+  if (ask.kind === "choice") return html`<label>${ask.label}
+      <select name="asked" aria-describedby=${about ?? nothing}>${ask.choices.map(([value, text]) => html`
+        <option value=${value} ?selected=${value === ask.chosen}>${text}</option>`)}</select></label>`;
   return html`<label>${ask.label}
       <input name="asked" type=${ask.kind} required autocomplete="off" maxlength="60" pattern=${ask.pattern || nothing}
         title=${ask.hint || nothing} aria-describedby=${ask.hint ? hint : nothing}></label>
     ${ask.hint ? html`<p class="hint" id=${hint}>${ask.hint}</p>` : nothing}`;
+}
+
+/** What an engineer types to see where a message comes from, and what there was to see then. */
+export function engineers(page, message, run) {
+  return html`<p class="quiet">${page.say("ask_engineer")} <code>runner why ${message} ${run}.mcap</code>,
+    <code>runner view ${run}.mcap --at ${message}</code></p>`;
 }
 
 /** A duration as people say it: 8 s, 1 min 5 s. */

@@ -3,7 +3,7 @@
 import {html, nothing, svg} from "./lit-html.js";
 import {graph} from "./graph.js";
 import {map} from "./map.js";
-import {button, lasted, solid} from "./parts.js";
+import {button, engineers, lasted, solid} from "./parts.js";
 
 const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
 const BOW = 50; // by which an arrow rises, in the same pixels
@@ -126,9 +126,9 @@ export function notice(page, notice, run = page.run?.name) {
     <p>${notice.text}</p>
     ${notice.help.length ? html`<ul>${notice.help.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
     ${title ? html`<p>${title}</p><ul>${tried.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
-    ${notice.good || !notice.message ? nothing : html`
-      ${run ? html`<p><a href="#history/${run}/${notice.message}">${page.say("see_moment")}</a></p>` : nothing}
-      <p class="quiet">${page.say("ask_engineer")} <code>runner why ${notice.message}</code></p>`}
+    ${notice.good || !notice.message || !run ? nothing : html`
+      <p><a href="#history/${run}/${notice.message}">${page.say("see_moment")}</a></p>
+      ${engineers(page, notice.message, run)}`}
   </div>`;
 }
 

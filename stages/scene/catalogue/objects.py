@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
@@ -107,6 +107,10 @@ class CatalogueObject:
     def dimensions(self) -> Floats:
         """h_x, h_y, h_z of the enclosing box, metres."""
         return self.bounds[1] - self.bounds[0]
+
+    def without_symmetries(self) -> CatalogueObject:
+        """The same as one sees it whose label matters."""
+        return replace(self, symmetries=Symmetries(np.empty((0, 4, 4)), (), np.empty((0, 4, 4))))
 
     def simplified(self, triangles: int) -> Mesh:
         """The mesh with at most about ``triangles`` triangles; deterministic and cached.

@@ -177,6 +177,11 @@ def test_what_is_kept_is_edited_downloaded_and_brought(page: Page, lamp: Lamp) -
     take_off = page.get_by_role("button", name="Take off")
     expect(take_off).to_have_accessible_description("It has a shade.")
     take_off.press("Enter")
+    colour = page.get_by_label("Colour")
+    expect(colour).to_have_accessible_description("It is red.")
+    expect(colour).to_have_value("red")
+    colour.select_option("light blue")
+    page.get_by_role("button", name="Paint").press("Enter")
     page.get_by_text("More", exact=False).first.press("Enter")
     page.get_by_label("What to write on it").fill("mine")
     page.keyboard.press("Enter")
@@ -187,7 +192,7 @@ def test_what_is_kept_is_edited_downloaded_and_brought(page: Page, lamp: Lamp) -
     page.get_by_role("button", name="Import").press("Enter")
     assert faults(page) == []
     page.goto(f"{page.url.partition('#')[0]}#engineer")
-    for note in ("is dark bare", "is dark mine", "is dark /wAgYSBsYW1w"):
+    for note in ("is dark bare", "is dark blue", "is dark mine", "is dark /wAgYSBsYW1w"):
         expect(page.get_by_role("log").get_by_text(note)).to_be_visible()
     assert asked(lamp.url, f"{urlsplit(lamp.url).path}file/g")[0] == 404
 
@@ -318,7 +323,8 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     expect(then).to_contain_text(f"has blinked {int(before) + 2} times")
     run = page.url.rpartition("/")[2]
     page.goto(f"{page.url.partition('#')[0]}#history/{run}/lamp.blinked#1")
-    expect(then).to_contain_text("runner why lamp.blinked#1")
+    expect(then).to_contain_text(f"runner why lamp.blinked#1 {run}.mcap")
+    expect(then).to_contain_text(f"runner view {run}.mcap --at lamp.blinked#1")
     page.get_by_label("Language").select_option("de")
     expect(page.get_by_role("region", name="Damals")).to_contain_text(f"{int(first) + 1}-mal geblinkt")
     path = urlsplit(lamp.url).path

@@ -90,6 +90,7 @@ class LampStory:
         ground = ((0.0, -0.5), (1.0, -0.5), (1.0, 0.5), (0.0, 0.5))
         places = (s.Place("table", "table", ground, 0.5, 0.0), s.Place("lamp", "lamp", square, x, y, movable=True))
         ask = s.Ask("times", "How often", "1 to 9", "[0-9]+")
+        colour = s.Ask("note", "Colour", kind="choice", choices=(("blue", "light blue"), ("red", "red")), chosen="red")
         outlines = tuple(
             s.Outline(surety, f"{surety} lamp", surety, "how sure", ((x, 20), (x + 9, 20), (x + 9, 40), (x, 40)))
             for x, surety in zip((2, 18, 34, 50), get_args(s.Surety), strict=True)
@@ -111,7 +112,10 @@ class LampStory:
                 s.Card(
                     *("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),
                     more=(s.Action("lamp", "switch", "Label", {}, s.Ask("note", "What to write on it")),),
-                    lines=(s.Line("It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),),
+                    lines=(
+                        s.Line("It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),
+                        s.Line("It is red.", (s.Action("lamp", "switch", "Paint", {}, colour),)),
+                    ),
                     lines_title="Its parts",
                     file=s.File("f", "lamp.txt", "Export", np.frombuffer(b"a lamp", np.uint8)),
                 ),

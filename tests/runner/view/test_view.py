@@ -45,6 +45,18 @@ def test_every_kind_of_drawing_lands_in_the_file(toys: Path, tmp_path: Path, cap
         assert path in found
 
 
+def test_a_recording_is_shown_until_a_message(toys: Path, tmp_path: Path):
+    shown = {}
+    for at in ("counter.number#0", "sink.finished#0"):
+        view_recording(toys, at=at, save=tmp_path / "toys.rrd")
+        shown[at] = entities(tmp_path / "toys.rrd")
+    first, last = shown.values()
+    assert "/camera" in first and "/samples" not in first and "/samples" in last
+    with pytest.raises(Refused, match=r"no message 'sink\.finished#1'; the nearest: sink\.finished#0"):
+        view_recording(toys, at="sink.finished#1", save=tmp_path / "none.rrd")
+    assert not (tmp_path / "none.rrd").exists()
+
+
 def test_what_cannot_be_drawn_is_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def spoil(record: object) -> object:
         if isinstance(record, Envelope) and record.id == "counter.number#1":

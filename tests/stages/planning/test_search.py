@@ -123,6 +123,21 @@ def test_a_tray_takes_several_objects_and_a_cup_is_emptied():
     assert valid(task, found_actions(task))
 
 
+def test_what_shows_another_side_is_picked_once_and_moved_when_its_turn_comes():
+    supports = {"tray": "table", "box": "tray", "cup": "box"}
+    task = problem(
+        supports,
+        {"box": "tray", "cup": "box"},
+        concave=frozenset({"tray"}),
+        graspable=frozenset({"box", "cup"}),
+        faced=frozenset({"box", "cup"}),
+        turned=frozenset({"box"}),
+    )
+    assert not task.satisfied()
+    assert steps(breadth_first(task)) == ["cup -> table", "box -> tray", "cup -> box"]
+    assert valid(task, found_actions(task)) and not valid(task, [])
+
+
 REGION = Region("can_near_box", "box", "can")
 SIDE_BY_SIDE = problem(
     {"tray": "table", "can": "table", "box": "table"},
