@@ -49,10 +49,14 @@ from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import corrected, open_doubt
+from stages.scene.facing import shows
 from stages.scene.goals import check_name
+from stages.scene.goals import without as left_out
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
 from stages.scene.virtual import satisfied, without
+
+_WRONG_SIDE = "is not seen to show the side that it should"
 
 
 class Phase(Enum):
@@ -498,13 +502,23 @@ class Demonstrator(Stage):
             yield Arrangement(kind="start")
 
     def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
-        """Checks the transfer that led here, then the goal; asks for a plan where relations are violated."""
+        """Checks the transfer that led here, then the goal; asks for a plan where relations are violated.
+
+        What was turned in vain as often as is tried need not show a side any more, until the verdict.
+        """
         self._check_transfer(scene, ctx)
         self._state = replace(self._state, missing="", searched=())
         held, violated = satisfied(goal, scene, self._catalogue)
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
         ctx.log(f"scene '{self._state.purpose}': {count}{from_memory}")
+        in_vain = {key.partition(":")[0] for key in self._avoided()}
+        wrong = next((item for item in violated if item.predicate == "faces" and item.arguments[0] in in_vain), None)
+        if wrong is not None:
+            lacking = "; ".join(filter(None, (self._state.lacking, f"{wrong.arguments[0]} {_WRONG_SIDE}")))
+            rest = left_out(goal, str(wrong))
+            self._state = replace(self._state, whole=self._state.whole or goal, goal=rest, lacking=lacking)
+            return self._compare(rest, scene, ctx)
         if not violated and self._state.lacking:
             return self._fail("perception", f"{self._state.lacking}; every other relation of the goal holds", ctx)
         if not violated:
@@ -529,6 +543,9 @@ class Demonstrator(Stage):
             complaint = ""
         if not complaint and not _reached(transfer, scene):
             complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
+        now = next((item for item in scene.objects if item.name == transfer.object), None)
+        if not complaint and transfer.faces and not (now and shows(now, transfer.T_base_targets[0])):
+            complaint = f"release: {transfer.object} {_WRONG_SIDE}"
         if not complaint:
             done = "done" if seen else "unknown: felt to stand, hidden from here"
             ctx.log(f"transfer {state.transfers}, {transfer.object} to {transfer.destination}: {done}")

@@ -39,9 +39,9 @@ def turned_to(T_base_object: Floats, side: Side) -> Floats:
     return T
 
 
-def faces(shown: SceneObject, side: Side, now: SceneObject) -> bool:
-    """Whether an object is seen to show a side; symmetries of its shape do not count."""
-    R = turned_to(shown.T_base_object, side)[:3, :3].T @ now.T_base_object[:3, :3]
+def shows(now: SceneObject, T_base_object: Floats) -> bool:
+    """Whether an object is seen to show the side that a pose says; symmetries of its shape do not count."""
+    R = T_base_object[:3, :3].T @ now.T_base_object[:3, :3]
     return is_told(now) and bool(np.trace(R) > 1 + 2 * np.cos(_WITHIN))
 
 
@@ -51,7 +51,7 @@ def held(goal: SceneGraph, current: SceneGraph) -> set[tuple[str, tuple[str, ...
     return {
         ("faces", (name, side))
         for name, side in sides(goal).items()
-        if name in now and faces(shown[name], side, now[name])
+        if name in now and shows(now[name], turned_to(shown[name].T_base_object, side))
     }
 
 

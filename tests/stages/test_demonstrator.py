@@ -37,6 +37,7 @@ from stages.messages import (
 from stages.messages.scene import Doubt, SceneObject
 from stages.messages.task import STOPPED
 from stages.robots import BUILT_IN
+from stages.scene.facing import faced, sides, turned_to
 from stages.scene.virtual import without
 from tests.stages.episodes import CATALOGUE, Recorded, outcome, plan, scene, transfer
 from tests.stages.layouts import T_BASE_TABLE, Layout
@@ -292,6 +293,55 @@ def test_everything_but_a_missing_object_is_restored() -> None:
     assert verdict.failed_stage == "perception" and "not seen: cup" in verdict.reason
     assert "exist(cup)" in [str(item) for item in verdict.violated]
     assert "on(soup_can, tea_box)" in [str(item) for item in verdict.satisfied]
+
+
+def told(graph: SceneGraph, T_base_carton: Floats, facing: float) -> SceneGraph:
+    """A scene in which the milk carton stands like that, and how well its side is told."""
+    return msgspec.structs.replace(
+        graph,
+        objects=tuple(
+            msgspec.structs.replace(item, T_base_object=T_base_carton, facing=facing)
+            if item.label == "milk_carton"
+            else item
+            for item in graph.objects
+        ),
+    )
+
+
+@pytest.mark.parametrize("facing", [0.99, 0.5])
+def test_what_is_turned_is_done_once_the_right_side_is_seen(facing: float) -> None:
+    """Where nobody sees the side it is turned as often as is tried, and the rest is restored all the same."""
+    shown = {"milk_carton": "table", "soup_can": "milk_carton"}
+    T = scene(shown).objects[0].T_base_object
+    goal = faced(told(scene(shown), T, 0.99), "milk_carton", "back")
+    found = scene({"milk_carton": "table", "soup_can": "table"})
+    step = msgspec.structs.replace(
+        transfer("milk_carton", "table", "table"), T_base_targets=turned_to(T, "back")[None], faces=True
+    )
+    episode = Episode(scripted=False)
+    keeping = KeepingDemonstrator(Demonstrator.Config(catalogue=CATALOGUE, scripted=False))
+    episode.stage = keeping
+    keeping.on_kept(Kept(goals=(Goal(name="milk", scene=goal, pddl=""),)))
+    episode.called(Restore(name="milk"))
+    (task,) = episode.seen(told(found, T, 0.99))
+    for number in (1, 2):
+        assert isinstance(task, Task) and "faces(milk_carton, back)" in map(str, task.goal.assertions)
+        episode.planned(step, transfer("soup_can", "table", "milk_carton"))
+        episode.ended(number, step)
+        (task,) = episode.seen(told(found, turned_to(T, "back"), facing))
+        if facing > 0.9:
+            assert isinstance(task, Task) and "transfer 1, milk_carton to table: done" in episode.ctx.lines
+            return
+    assert isinstance(task, Task) and not sides(task.goal) and "soup_can" in str(task.goal.assertions)
+    lift = transfer("soup_can", "table", "milk_carton")
+    episode.planned(lift)
+    episode.ended(3, lift)
+    verdict = the_verdict(episode.seen(told(scene(shown), turned_to(T, "back"), facing)))
+    assert (verdict.success, verdict.failed_stage) == (False, "perception")
+    assert verdict.reason == (
+        "milk_carton is not seen to show the side that it should; every other relation of the goal holds"
+    )
+    assert [str(item) for item in verdict.violated] == ["faces(milk_carton, back)"]
 
 
 def test_an_object_found_on_the_second_look_goes_on() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from runner.contract import Refused
 from stages.messages import Goal, SceneGraph
 from stages.messages.scene import Side
-from stages.scene.facing import SIDES, TOLD, faced, faces, sides
+from stages.scene.facing import SIDES, TOLD, faced, shows, sides
 from stages.scene.goals import without
 from stages.scene.stance import yawed
 from stages.scene.truth import Truth
@@ -43,9 +43,9 @@ def test_a_side_holds_up_to_an_eighth_of_a_turn_whatever_the_shape(side: Side, d
 
 def test_a_side_that_is_not_seen_does_not_count() -> None:
     shown = GOAL.graph().objects[0]
-    assert faces(shown, "shown", shown)
+    assert shows(shown, shown.T_base_object)
     for facing in (None, TOLD - 0.01):
-        assert not faces(shown, "shown", msgspec.structs.replace(shown, facing=facing))
+        assert not shows(msgspec.structs.replace(shown, facing=facing), shown.T_base_object)
 
 
 @given(st.lists(ANY_SIDE, min_size=1, max_size=4))

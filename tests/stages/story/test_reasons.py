@@ -59,6 +59,15 @@ SAID = {
         "die Tasse lässt sich in keiner Reihenfolge dorthin bringen"
     ),
     "release: cup is not seen on or in tray": "beim Loslassen: die Tasse ist nicht auf oder in dem Tablett zu sehen",
+    "mug would have to be turned, but it has no grasp in the catalogue": (
+        "der Becher müsste gedreht werden, aber das Ding lässt sich nicht greifen"
+    ),
+    "2 transfers were not enough; faces(mug, back) does not hold": (
+        "nach 2 Bewegungen ist es noch nicht geschafft: der Becher zeigt nicht die Seite, die sichtbar sein soll"
+    ),
+    "mug is not seen to show the side that it should; every other relation of the goal holds": (
+        "bei dem Becher ist nicht zu sehen, dass die gewünschte Seite vorn ist; alles andere ist am Platz"
+    ),
     "the goal needs cup_2, not in the current scene": "es fehlt: die Tasse 2",
 }
 """With what is said of it in German."""
