@@ -285,7 +285,7 @@ SPOTS = [(-0.1, 0.3), (-0.1, -0.3), (0.05, 0.3), (0.05, -0.3), (-0.1, 0.0)]
 
 
 @given(st.permutations(SPOTS), st.lists(st.floats(-np.pi, np.pi), min_size=5, max_size=5))
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 def test_random_starts_are_solved_without_overlap(spots: list[tuple[float, float]], yaws: list[float]):
     start = Layout().put("tray", 0.12, 0.0, yaw=np.pi / 2)
     names = ["bowl", "cup", "tea_box", "tuna_can", "soup_can"]
@@ -425,7 +425,7 @@ def test_an_object_stands_wholly_on_what_carries_it_with_a_margin(upper: str):
         assert middle >= 0.01 if wide else regions.inside(item.bottom, carrier.top, margin=Workspace().clearance)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     st.tuples(st.floats(-0.15, 0.02), st.floats(-0.4, -0.15)), st.floats(0.15, 0.4), st.floats(-0.6, 0.6),
     st.sampled_from(["water_bottle", "sauce_bottle", "mug", "tea_box"]), st.tuples(st.floats(-3.2, 3.2), st.booleans()),

@@ -116,7 +116,7 @@ def test_a_success_that_the_truth_denies_exits_with_what_does_not_hold(tmp_path:
     assert "objects lost or knocked over: 0, 0 of them unsaid" in text
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.randoms(use_true_random=False), st.booleans())
 def test_any_order_of_arrival_gives_the_same_report_once(shuffle: random.Random, success: bool) -> None:
     arrivals = episode(success=success)

@@ -404,9 +404,7 @@ PLACES = st.integers(0, 10_000)
 CHANGES = st.lists(
     st.tuples(st.sampled_from(("drop", "cut", "end", "move", "copy", "swap")), PLACES, PLACES), min_size=1, max_size=3
 )
-ANYHOW = settings(
-    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.filter_too_much]
-)
+ANYHOW = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.filter_too_much])
 
 
 def changed(items: Items, changes: list[tuple[str, int, int]]) -> Items:

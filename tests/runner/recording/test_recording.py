@@ -31,7 +31,7 @@ from runner.recording.writer import RecordingWriter
 from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys
 from tests.runner.common.toys import Number, Total
 
-FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")

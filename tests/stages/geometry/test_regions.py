@@ -20,7 +20,7 @@ def region(box: tuple[float, float, float, float, float]) -> regions.Region:
 
 
 @given(boxes, boxes)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_overlap_agrees_with_counted_points(a: tuple[float, ...], b: tuple[float, ...]):
     first, second = region(a), region(b)  # type: ignore[arg-type]
     axis = np.linspace(-0.5, 0.5, 200)
@@ -30,7 +30,7 @@ def test_overlap_agrees_with_counted_points(a: tuple[float, ...], b: tuple[float
 
 
 @given(boxes, boxes)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_gap_is_symmetric_and_never_below_the_separation(a: tuple[float, ...], b: tuple[float, ...]):
     first, second = region(a), region(b)  # type: ignore[arg-type]
     assert regions.gap(first, second) == pytest.approx(regions.gap(second, first), abs=1e-12)

@@ -36,7 +36,7 @@ def above_table(x: float, y: float) -> np.ndarray:
     return T
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**31))
 def test_ik_finds_the_pose_that_fk_reports(scene: CollisionWorld, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -223,7 +223,7 @@ def towers(draw: st.DrawFn) -> dict[str, str]:
 
 
 @given(towers(), towers(), st.sets(st.sampled_from("abcde"), min_size=1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_plans_are_as_short_as_exhaustive_search_finds(start: dict[str, str], end: dict[str, str], named: set[str]):
     goal = {name: support for name, support in end.items() if name in named}
     solution = breadth_first(problem(start, goal))
@@ -232,7 +232,7 @@ def test_plans_are_as_short_as_exhaustive_search_finds(start: dict[str, str], en
 
 
 @given(towers(), towers())
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_plans_are_valid_in_pddl(start: dict[str, str], end: dict[str, str]):
     task = problem(start, end)
     assert valid(task, found_actions(task))

@@ -44,7 +44,7 @@ def test_nothing_hides_what_stands_alone() -> None:
     assert hidden(Layout().put("mug", 0.0, 0.0), "mug") == 0.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.floats(-0.2, 0.3), st.floats(-0.2, 0.2), st.floats(-3, 3),
     st.tuples(st.floats(-1.0, -0.4), st.floats(-0.5, 0.5), st.floats(0.3, 1.2)),

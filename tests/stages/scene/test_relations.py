@@ -59,7 +59,7 @@ def test_what_carries_what(name: str):
 
 
 @given(st.sampled_from(sorted(SCENES)), st.integers(0, 2**32 - 1))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_noise_of_the_estimate_changes_nothing(name: str, seed: int):
     layout, expected = SCENES[name]
     noisy = layout.disturbed(np.random.default_rng(seed), metres=0.005, degrees=3)
@@ -67,7 +67,7 @@ def test_noise_of_the_estimate_changes_nothing(name: str, seed: int):
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-0.3, 0.3))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_where_the_scene_stands_changes_nothing(yaw: float, x: float):
     layout, expected = SCENES["breakfast"]
     T = np.eye(4)

@@ -61,7 +61,7 @@ def test_what_cannot_be_moved_is_the_root():
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_region_moves_with_its_parent(yaw: float, x: float, y: float):
     goal = beside()
     assert violated(goal.graph(), goal.moved(yawed(yaw, np.array([x, y, 0.0]))).graph()) == set()
@@ -77,7 +77,7 @@ def test_a_box_has_the_region_on_either_side():
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_round_parent_has_a_ring(at: float, yaw: float):
     goal = Layout().put("bowl", 0, 0).put("salt_shaker", 0.13, 0)
     ring = Layout().put("bowl", 0, 0, yaw=yaw).put("salt_shaker", 0.13 * np.cos(at), 0.13 * np.sin(at))
@@ -86,7 +86,7 @@ def test_a_round_parent_has_a_ring(at: float, yaw: float):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_noise_of_the_estimate_violates_nothing(seed: int):
     noisy = breakfast().disturbed(np.random.default_rng(seed), metres=0.005, degrees=3)
     assert violated(breakfast().graph(), noisy.graph()) == set()

@@ -140,7 +140,7 @@ ANY_POSE = st.builds(
 
 
 @given(poses=st.lists(ANY_POSE, min_size=3, max_size=3), plain=st.booleans(), mug=st.booleans())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_costs_are_the_cpu_kernels_and_the_oracles(poses: list[Floats], plain: bool, mug: bool) -> None:
     seen, mesh = scene(), MUG if mug else BOX
     cpu = likelihood(mesh, seen, CostForm.paper() if plain else CostForm(), (0, 0, WIDTH, HEIGHT))

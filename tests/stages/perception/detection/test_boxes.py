@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.perception.detection.boxes import (
@@ -44,7 +44,6 @@ def box_strategy() -> st.SearchStrategy[tuple[float, float, float, float]]:
     return st.tuples(corner, corner, size, size).map(lambda b: (b[0], b[1], b[0] + b[2], b[1] + b[3]))
 
 
-@settings(deadline=None)
 @given(box_strategy(), st.floats(0.3, 3), st.floats(0.3, 3), st.floats(-30, 30))
 def test_offsets_take_the_anchor_back_to_its_box(
     anchor: tuple[float, float, float, float], wider: float, higher: float, shift: float

@@ -44,7 +44,7 @@ def test_diffusion_turns_about_the_centre_and_shifts() -> None:
 
 
 @given(vector=st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3), size=st.permutations([0.03, 0.075, 0.11]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_a_box_that_lies_askew_in_its_frame_has_the_axes_of_its_faces(vector: list[float], size: list[float]) -> None:
     R = exp_so3(np.array(vector))
     corners = (np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3) - 0.5) * np.array(size)
@@ -72,7 +72,7 @@ def test_flips_keep_the_centre_and_differ_from_one_another_modulo_symmetry() -> 
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(1, 12))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_distinct_poses_are_the_cheapest_that_are_far_apart(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     poses = np.concatenate([exp_so3(rng.normal(0, 0.1, (60, 3))), rng.normal(0, 0.01, (60, 3))[..., None]], -1)

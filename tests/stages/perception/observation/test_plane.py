@@ -71,7 +71,7 @@ def test_no_plane_is_found_where_none_is(depth: np.ndarray, up: np.ndarray | Non
 
 
 @given(pitch=st.floats(0.25, 1.5), distance=st.floats(0.5, 1.5), seed=st.integers(0, 100))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_an_empty_table_is_found_from_anywhere(pitch: float, distance: float, seed: int) -> None:
     truth = camera(distance=distance, pitch=pitch)
     rng = np.random.default_rng(seed)

@@ -51,7 +51,7 @@ def test_the_grid_has_the_distance_and_the_side_of_every_triangle_asked(label: s
 
 
 @given(depth=st.floats(0.003, 0.02), yaw=st.floats(-3.0, 3.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_penetration_is_as_deep_as_one_box_reaches_into_another(depth: float, yaw: float) -> None:
     lower, upper = upright("sponge", 0.0, 0.0, yaw), lifted("sponge", 0.0, 0.0, yaw, SPONGE_HEIGHT - depth)
     found = touching([("sponge", lower), ("sponge", upper)])
@@ -59,7 +59,7 @@ def test_penetration_is_as_deep_as_one_box_reaches_into_another(depth: float, ya
 
 
 @given(gap=st.floats(0.002, 0.1), yaw=st.floats(-3.0, 3.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_gap_is_the_way_to_what_would_carry_the_object(gap: float, yaw: float) -> None:
     lower, upper = upright("sponge", 0.0, 0.0, 0.0), lifted("mug", 0.01, 0.0, yaw, SPONGE_HEIGHT + gap)
     found = touching([("sponge", lower), ("mug", upper)])
@@ -68,7 +68,7 @@ def test_the_gap_is_the_way_to_what_would_carry_the_object(gap: float, yaw: floa
 
 
 @given(turn=st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_contact_does_not_depend_on_where_the_camera_is(turn: list[float]) -> None:
     placed = [("sponge", upright("sponge", 0.0, 0.0, 0.4)), ("mug", lifted("mug", 0.02, 0.0, 0.0, 0.03))]
     here, there = touching(placed), touching(placed, pose(exp_so3(np.array(turn)), np.array([0.1, -0.2, 0.9])))

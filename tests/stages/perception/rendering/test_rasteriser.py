@@ -19,7 +19,7 @@ VIEW = View(110.0, 112.0, 39.2, 30.7, 80, 60)
     turn=st.tuples(*[st.floats(-3, 3)] * 3),
     shift=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(0.35, 1.0)),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_kernel_agrees_with_the_oracle(label: str, turn: tuple[float, ...], shift: tuple[float, ...]) -> None:
     mesh = CATALOGUE[label].simplified(200)
     T = pose(exp_so3(np.array(turn)), np.array(shift))
