@@ -22,7 +22,7 @@ from benchmarks.live import process, running
 from runner.live.live import Live
 
 STAGES = {
-    "publisher": {"stage": "benchmarks.recording_stages:Speaker", "config": {"hertz": 1e9, "seconds": 3600.0}},
+    "publisher": {"stage": "benchmarks.recording_stages:Speaker", "config": {"hertz": 1e9, "seconds": 1e9}},
     "consumer": {
         "stage": "benchmarks.recording_stages:Listener",
         "inputs": {"word": {"from": "publisher.word", "policy": "block", "queue": 64}},

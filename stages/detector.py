@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
@@ -52,8 +53,13 @@ class Detector(Stage):
             if self.max_boxes < 1:
                 raise Refused(f"detector.max_boxes = {self.max_boxes}: must be at least 1")
 
+    @classmethod
+    def prepare(cls, config: Config) -> None:
+        """Loads torch, which takes a second: for the refiner too, where there is one."""
+        import_module("torch")
+
     def __init__(self, config: Config) -> None:
-        # torch takes a second to load; whoever only reads a graph does without.
+        # Whoever only reads a graph does without.
         import torch
 
         from stages.perception.detection.trained.network import DetectionNetwork, detect

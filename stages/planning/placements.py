@@ -122,7 +122,7 @@ class Placements:
     def _orientations(self, T: Floats, item: Standing, scene: Scene) -> list[tuple[Floats, float]]:
         """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it."""
         if item.name not in self._sides:
-            return _orientations(T, item)
+            return _any_side(T, item)
         faced = inverse(scene.T_base_table) @ turned_to(self._poses[item.name], self._sides[item.name])
         faced[:3, 3] = T[:3, 3]
         return [(faced, 0.0)]
@@ -206,7 +206,7 @@ def _shifted(item: Standing, shift: tuple[float, float]) -> Standing:
     return replace(item, T_table_stance=yawed(0.0, np.array([*shift, 0.0])) @ item.T_table_stance)
 
 
-def _orientations(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
+def _any_side(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
     """Ways to turn an object at a demonstrated pose, with their cost.
 
     First those that look the same and keep the side up that is up now, so that nobody has to turn it over; where

@@ -149,9 +149,9 @@ class SceneRefiner:
         self._models: dict[str, _Model] = {}
 
     def warm_up(self) -> None:
-        """Lays out every object and compiles the kernels (or loads them), so that the first image waits for nothing."""
+        """Lays out every mesh and compiles the kernels (or loads them); solids and paint wait until they are needed."""
         for label in self._catalogue.objects:
-            self._model(label).prepare()
+            self._model(label)
         T_camera_table = np.diag([1.0, -1.0, -1.0, 1.0])
         T_camera_table[2, 3] = 1.1
         depth = np.full((48, 64), 1.1, np.float32)
@@ -189,11 +189,6 @@ class _Model:
         turns = item.symmetries.transforms(_YAW_STEP)
         self.turns = turns if settings.dof == 6 else turns[turns[:, 2, 2] > _UPRIGHT]
         """Exact symmetries, of which depth knows nothing, identity first."""
-
-    def prepare(self) -> None:
-        """Makes what takes time."""
-        assert self.solid
-        assert self.paint
 
     @cached_property
     def solid(self) -> Solid:
