@@ -2,8 +2,10 @@
 
 Runs a graph with a camera of five pictures a second and one stage a core that computes all the time, and prints
 
-* the time from opening the page's address to its first paint, in a browser without a cache: median and slowest;
-* how far the picture on the page is behind the camera: from when it was taken to when the browser has painted it;
+* the time from opening the page's address to its first paint and to its first picture, in a browser without a cache;
+* how far each later picture is behind the camera: from when it was taken to when the browser has painted it. All this
+  twice: with a core that the browser has for itself, as on a tablet beside the table, while the graph and the page's
+  server share all others; and where the graph fills every core and the browser waits for its turn as everybody does;
 * what the graph computes a second and the processor time that it has for it, and what the page's server and the open
   pages take of a core: without a page process, with one that nobody has open, with one open page and with ten. Open
   pages are connections that take everything and every picture: what browsers draw would be drawn on other machines, as
@@ -22,7 +24,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Generator
+from collections.abc import AsyncGenerator, Collection, Generator
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from queue import Queue
@@ -35,7 +37,7 @@ import psutil
 from playwright.sync_api import sync_playwright
 from websockets.asyncio.client import connect
 
-from benchmarks.live import process, running
+from benchmarks.live import running
 from runner.live.live import Live
 from runner.page.start import page_beside
 from stages.geometry.arrays import Floats
@@ -45,17 +47,46 @@ SECONDS = 10.0
 SETTLE_SECONDS = 3.0
 """Until what has just been started or opened is at rest."""
 OPTIONS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
+GRINDER = "grinder"
+LATE_MS = 300
+"""That a picture may be behind."""
 COUNTS = (None, 0, 1, 10)
 """Open pages; None without a page process."""
-DELAYS = """
+NOTES = """
+    window.first = 0;
     window.delays = [];
     document.addEventListener("load", ({target}) => {
-      const taken = Number(/photo\\/(\\d+)\\.jpg/.exec(target.src ?? "")?.[1] ?? 0) / 1e6;
-      const note = () => window.delays.push(performance.timeOrigin + performance.now() - taken);
-      if (taken > performance.timeOrigin) requestAnimationFrame(note);
+      const [, key] = /photo\\/(\\d+)\\.jpg/.exec(target.src ?? "") ?? [];
+      if (!key) return;
+      const taken = key / 1e6 - performance.timeOrigin;
+      requestAnimationFrame(() => {
+        if (window.first && taken > window.first) window.delays.push(performance.now() - taken);
+        window.first ||= performance.now();
+      });
     }, true);
 """
-"""Milliseconds by which each picture is late that was taken since the page was opened."""
+"""When the first picture was painted, and the milliseconds by which each is late that was taken from then on."""
+
+
+@contextlib.contextmanager
+def on(cores: Collection[int]) -> Generator[None]:
+    """Has what is started meanwhile run on these cores only."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@contextlib.contextmanager
+def filling(cores: Collection[int]) -> Generator[Live]:
+    """A graph that fills these cores, looked at from them: a camera, and a stage a core that computes all the time."""
+    stages = {"camera": {"stage": "benchmarks.page_stages:Photographer", "config": {"hertz": 5, "seconds": 3600}}}
+    stages |= {f"{GRINDER}{core}": {"stage": "benchmarks.page_stages:Grinder"} for core in cores}
+    story = "benchmarks.page_stages:PictureStory"
+    with tempfile.TemporaryDirectory() as folder, on(cores), running(Path(folder), "page", stages, story=story) as live:
+        yield live
 
 
 @contextlib.contextmanager
@@ -66,22 +97,23 @@ def served(live: Live) -> Generator[tuple[psutil.Process, str]]:
         yield psutil.Process(page.pid), said.get(timeout=60).split()[1]
 
 
-def shown(url: str, rounds: int) -> tuple[list[float], list[float]]:
-    """Milliseconds until first paint, one a round, and by which each picture of one page is late."""
-    paints, delays = list[float](), list[float]()
+def shown(url: str, rounds: int) -> tuple[list[float], list[float], list[float]]:
+    """Milliseconds until first paint and until the first picture, one a round, and by which each later one is late."""
+    paints, firsts, delays = list[float](), list[float](), list[float]()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=list(OPTIONS))
         for _ in range(rounds):
             page = browser.new_context().new_page()
-            page.add_init_script(DELAYS)
+            page.add_init_script(NOTES)
             page.goto(url)
             page.wait_for_selector("figure img")
             paints.append(page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime"))
-            page.wait_for_timeout(1000 * SECONDS / rounds)
+            page.wait_for_timeout(1000 * SECONDS)
+            firsts.append(page.evaluate("window.first"))
             delays += page.evaluate("window.delays")
             page.context.close()
         browser.close()
-    return paints, delays
+    return paints, firsts, delays
 
 
 @contextlib.asynccontextmanager
@@ -133,8 +165,7 @@ async def cost(live: Live, page: psutil.Process | None, url: str, count: int) ->
 
 def _used(live: Live, page: psutil.Process | None) -> Floats:
     """Words, and seconds of a core, so far."""
-    status = live.status()
-    grinders = [process(status, f"grinder{k}") for k in range(os.cpu_count() or 1)]
+    grinders = [process for process in live.status().processes if process.stage.startswith(GRINDER)]
     words = sum(grinder.sent["word"].messages for grinder in grinders)
     computing = sum(_seconds(psutil.Process(grinder.pid)) for grinder in grinders)
     return np.array([words, computing, _seconds(page) if page else 0.0, _seconds(psutil.Process())])
@@ -145,21 +176,24 @@ def _seconds(process: psutil.Process) -> float:
     return times.user + times.system
 
 
-def main() -> None:
-    """Prints paint, delay and cost."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
-    stages = {"camera": {"stage": "benchmarks.page_stages:Photographer", "config": {"hertz": 5, "seconds": 3600}}}
-    stages |= {f"grinder{k}": {"stage": "benchmarks.page_stages:Grinder"} for k in range(os.cpu_count() or 1)}
-    story = "benchmarks.page_stages:PictureStory"
-    with tempfile.TemporaryDirectory() as folder, running(Path(folder), "page", stages, story=story) as live:
-        with served(live) as (_, url):
-            paints, delays = shown(url, options.rounds)
-        print(f"first paint     {median(paints):6.0f} ms, slowest of {len(paints)} {max(paints):.0f} ms")
-        print(f"picture behind  {median(delays):6.0f} ms, slowest of {len(delays)} {max(delays):.0f} ms", flush=True)
-        found: dict[int | None, list[Floats]] = {count: [] for count in COUNTS}
-        for _ in range(options.rounds):
+def print_delays(rounds: int) -> None:
+    """First paint, and how far pictures are behind, with a core for the browser alone and without one."""
+    cores = sorted(os.sched_getaffinity(0))
+    for own in (cores[-1:], []):
+        with filling([core for core in cores if core not in own]) as live, served(live) as (_, url), on(own or cores):
+            paints, firsts, delays = shown(url, rounds)
+        print(f"browser with a core of its own: {'yes' if own else 'no'}")
+        late = sum(delay > LATE_MS for delay in delays)
+        for name, found in (("first paint", paints), ("first picture", firsts), ("picture behind", delays)):
+            print(f"  {name:<15}{median(found):6.0f} ms, slowest of {len(found)} {max(found):.0f} ms")
+        print(f"  more than {LATE_MS} ms behind: {late}", flush=True)
+
+
+def print_costs(rounds: int) -> None:
+    """What a graph that fills every core has beside none, one and ten open pages."""
+    found: dict[int | None, list[Floats]] = {count: [] for count in COUNTS}
+    with filling(os.sched_getaffinity(0)) as live:
+        for _ in range(rounds):
             found[None].append(asyncio.run(cost(live, None, "", 0)))
             with served(live) as (page, url):
                 for count in (0, 1, 10):
@@ -173,6 +207,15 @@ def main() -> None:
             f"{name:<16}{said:8.1f} words/s ({words:6.1%}), of a core: what says them {computing:7.2%} ({cores:6.1%}), "
             f"server {cpu:6.2%}, pages {own:6.2%}"
         )
+
+
+def main() -> None:
+    """Prints paint, delay and cost."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args()
+    print_delays(options.rounds)
+    print_costs(options.rounds)
 
 
 if __name__ == "__main__":

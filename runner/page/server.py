@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import logging
 import os
 import socket
 import threading
@@ -329,6 +330,8 @@ def serve(entry: Entry, *, address: str, port: int, token: str) -> None:
         timeout_graceful_shutdown=CLOSE_SECONDS,
     )
     server = uvicorn.Server(config)
+    # whoever watches the robot in 3D reads an answer without an end
+    logging.getLogger("uvicorn.error").addFilter(lambda record: "graceful shutdown" not in record.getMessage())
     with Live(entry) as live:
         server.run([listener])
 
