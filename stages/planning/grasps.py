@@ -46,10 +46,11 @@ def hand_poses(entry: CatalogueObject, grasp: Grasp, T_base_object: Floats) -> l
     """Every way to apply ``grasp`` to the object at ``T_base_object`` (4 x 4), most natural first.
 
     Two hand poses of one object and grasp differ by a symmetry only: picked with one, the object may be placed
-    with any other. Approaches from below are left out; the others are ordered by how much they point away from
-    the robot, then as the symmetries come.
+    with any other. Approaches from below are left out, as are those with a finger below the object; the others are
+    ordered by how much they point away from the robot, then as the symmetries come.
     """
-    poses = [pose for pose in _all_poses(entry, grasp, T_base_object) if pose.T_base_hand[2, 0] <= _STEEPEST]
+    low = float((entry.mesh.vertices @ T_base_object[2, :3]).min() + T_base_object[2, 3])
+    poses = [pose for pose in _all_poses(entry, grasp, T_base_object) if _is_from_above(pose, low)]
     return _distinct(sorted(poses, key=lambda pose: -_outward(pose)))
 
 
@@ -74,6 +75,12 @@ def _hand_pose(grasp: Grasp, T_base_object: Floats, symmetry: Floats) -> HandPos
         T_base_prehand=T_base_object @ symmetry @ grasp.T_object_pregrasp,
         T_object_hand=T_object_hand,
     )
+
+
+def _is_from_above(pose: HandPose, low: float) -> bool:
+    """Whether the hand does not come from below, and neither finger gets below the height ``low``."""
+    x, y, _, origin = pose.T_base_hand[2]
+    return x <= _STEEPEST and origin - abs(y) * pose.grasp.width / 2 >= low
 
 
 def _outward(pose: HandPose) -> float:

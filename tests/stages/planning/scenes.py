@@ -21,11 +21,14 @@ def catalogue() -> Catalogue:
     return Catalogue.load(CATALOGUE_FILE)
 
 
-def standing(name: str, x: float, y: float, *, yaw: float = 0.0, height: float = TABLE.height) -> Floats:
-    """T_base_object of an upright object."""
+def standing(
+    name: str, x: float, y: float, *, yaw: float = 0.0, height: float = TABLE.height, resting: int = 0
+) -> Floats:
+    """T_base_object of an object in one of its resting poses, upright by default."""
     c, s = np.cos(yaw), np.sin(yaw)
-    bottom = catalogue()[name].bounds[0, 2]
-    return pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([x, y, height - bottom]))
+    R = catalogue()[name].resting[resting]
+    bottom = (catalogue()[name].mesh.vertices @ R[2]).min()
+    return pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ R, np.array([x, y, height - bottom]))
 
 
 def world(carried: str, **poses: Floats) -> CollisionWorld:
