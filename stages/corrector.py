@@ -200,7 +200,7 @@ class Corrector(Stage):
         yield self._next()
 
     def _in_the_way(self, frame: Frame, ctx: Context) -> tuple[float, Floats] | None:
-        """The table's height and boxes around what stands on it; None where no table is seen."""
+        """The table's height at most and boxes around what stands on it; None where no table is seen."""
         assert frame.T_base_camera is not None  # Who asks has seen to that.
         readings = frame.depth if frame.robot_mask is None else np.where(frame.robot_mask, 0, frame.depth)
         return occupied(readings.astype(np.float32), _view_of(frame), frame.T_base_camera, self._robot, ctx.rng)

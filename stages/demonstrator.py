@@ -339,9 +339,17 @@ class Demonstrator(Stage):
         if self._state.stopping:
             return self._stopped(ctx)
         self._state = replace(self._state, plans=self._state.plans + 1)
-        if plan.status == "solved":
-            return self._wait(plan, ctx) if self._state.waits else self._proceed(plan, ctx)
-        return self._without_plan(plan, ctx)
+        if plan.status != "solved":
+            return self._without_plan(plan, ctx)
+        if self._state.missing:
+            # What was to be put aside, or what is in the way of that: each once.
+            *before, _ = self._state.searched
+            moved = plan.transfers[0].object
+            if moved in before:
+                again = msgspec.structs.replace(plan, reason=f"{moved} was put aside before")
+                return self._without_plan(again, ctx)
+            self._state = replace(self._state, searched=(*before, moved))
+        return self._wait(plan, ctx) if self._state.waits else self._proceed(plan, ctx)
 
     def _without_plan(self, plan: Plan, ctx: Context) -> LookRequest | Task | Verdict:
         """Looks again, or behind something else."""
@@ -434,9 +442,7 @@ class Demonstrator(Stage):
     def _hiders(self, scene: SceneGraph, goal: SceneGraph) -> list[str]:
         missing = [self._stances[item.label] for item in goal.objects if item.name not in _names(scene)]
         movable = {item.name for item in scene.objects if self._catalogue[item.label].grasps}
-        perceived = standing_of(scene.objects, self._stances, scene.T_base_table)
-        heights = {item.name: item.z_bottom for item in perceived}
-        return hiders(missing, Scene.of(scene, self._stances), movable, heights)
+        return hiders(missing, Scene.of(scene, self._stances), movable)
 
     def _look(self, purpose: str) -> LookRequest:
         """From home; for a goal first from elsewhere, where nothing is known of the scene or it is looked at again."""

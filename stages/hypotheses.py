@@ -22,7 +22,7 @@ from stages.perception.hypotheses.combinations import (
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
-from stages.perception.hypotheses.revisions import Revision, is_better, relabelled, revisions
+from stages.perception.hypotheses.revisions import Revision, is_better, refitted, relabelled, revisions
 from stages.perception.observation.preprocessing import preprocess
 
 
@@ -112,8 +112,9 @@ class Hypotheses(Stage):
             before = () if several else search.unexplained
             revised = revisions(best, search.offers, before)[: self.config.finalists]
             revised += relabelled(best, search.offers, before)[: self.config.finalists]
+            revised += [each for each in refitted(best, search.offers) if each not in revised]
         if search and revised:
-            ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained")
+            ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained or fits badly")
             following = msgspec.structs.replace(
                 search, earlier=contenders, rounds=search.rounds + 1, unexplained=best.unexplained
             )

@@ -144,23 +144,34 @@ class Planner(Stage):
         return plan if plan.status == "solved" else refused
 
     def _put_aside(self, task: Task, ctx: Context) -> Plan:
-        """One transfer, to a place on the table where the object hides nothing of what it hides now."""
+        """One transfer, to a place on the table where the object hides nothing of what it hides now; of what keeps the
+        hand from it, where something does."""
         scene = Scene.of(task.current, self._stances)
-        step = Step(task.aside, scene.supports[task.aside], TABLE)
         workspace = replace(self._config.workspace, targets=_ASIDE)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
-        poses = Targets(Placements(task.current, self._stances, task.current), workspace, self._robot, handling, {}).of(
-            (step,), scene
-        )
-        if isinstance(poses, Blocked | Crowded):
-            return _answer("refused", "", reason=f"no room to put {task.aside} aside")
-        item, T_table_base = scene.standing[task.aside], inverse(scene.T_base_table)
+        targets = Targets(Placements(task.current, self._stances, task.current), workspace, self._robot, handling, {})
+        problem = self._problem(task, ())
+        ahead, tried = [task.aside], list[str]()
+        while ahead:
+            name = ahead.pop()
+            tried.append(name)
+            step = Step(name, scene.supports[name], TABLE)
+            poses = targets.of((step,), scene)
+            if isinstance(poses, list):
+                return self._uncovering(step, poses[0], scene, problem)
+            if isinstance(poses, Blocked):
+                tops = problem.graspable.intersection(poses.obstacles).difference(tried, scene.supports.values())
+                ahead += sorted(tops, reverse=True)
+        return _answer("refused", "", reason=f"no room to put {task.aside} aside")
+
+    def _uncovering(self, step: Step, T_base_targets: Floats, scene: Scene, problem: Problem) -> Plan:
+        """The transfer to those places where the object hides nothing of what it hides now."""
+        item, T_table_base = scene.standing[step.item], inverse(scene.T_base_table)
         stances = self._stances[item.stance.item.name]
-        places = ((T, Standing.at(task.aside, stances, T_table_base @ T)) for T in poses[0])
+        places = ((T, Standing.at(step.item, stances, T_table_base @ T)) for T in T_base_targets)
         free = [T for T, place in places if scene.eye is None or uncovers(item, place, scene.eye)]
         if not free:
-            return _answer("refused", "", reason=f"wherever {task.aside} could be put, it would hide the same")
-        problem = self._problem(task, ())
+            return _answer("refused", "", reason=f"wherever {step.item} could be put, it would hide the same")
         chosen = np.stack(free[: self._config.workspace.targets])
         return _answer("solved", "", transfers=[_transfer(step, chosen, problem)])
 

@@ -18,23 +18,19 @@ _GRID = 0.05
 """Metres between the places at which an object is imagined."""
 _HIDDEN = 0.6
 """Share of an imagined object that must be hidden for it not to be seen."""
-_HANGS = 0.012
-"""Metres above what carries it from which on something must be under an object."""
 _BEHIND = (0.0, 0.06, 0.12, 0.18)
 """Metres behind the place of what is moved that are to be seen afterwards."""
 
 
-def hiders(missing: Sequence[Stances], scene: Scene, movable: Collection[str], heights: dict[str, float]) -> list[str]:
+def hiders(missing: Sequence[Stances], scene: Scene, movable: Collection[str]) -> list[str]:
     """What may hide any of the ``missing`` objects, what hides most places first.
 
-    ``heights``: of the bottom of each object as it was perceived, metres above the table. What hangs in the air stands
-    on something unseen, and comes first. Of a stack the top is moved first.
+    What hangs in the air stands on something unseen, and comes first. Of a stack the top is moved first.
     """
     scores: dict[str, float] = {}
     imagined = list(_imagined(missing, scene))
-    for name, item in scene.standing.items():
-        hangs = heights[name] - item.z_bottom > _HANGS
-        share = np.inf if hangs else float(sum(_hides(name, place, scene) for place in imagined))
+    for name in scene.standing:
+        share = np.inf if scene.hangs(name) else float(sum(_hides(name, place, scene) for place in imagined))
         top = _top(name, scene)
         if share > 0 and top in movable:
             scores[top] = max(share, scores.get(top, 0.0))

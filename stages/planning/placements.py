@@ -26,6 +26,8 @@ TURNED = 0.03
 """Cost of a quarter turn that the demonstration did not show, in metres of shift."""
 LAID = 0.05
 """Cost of leaving the object lying (or standing) as it is where the demonstration shows it otherwise."""
+_HANGS = 0.012
+"""Metres above what carries it from which on something must be under an object."""
 _ANYWHERE = 1.0
 """Metres from where it was shown within which an object may stand that only has to be on the table."""
 
@@ -44,14 +46,21 @@ class Scene:
 
     @staticmethod
     def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
-        """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy."""
+        """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy; what hangs in
+        the air stays there, for it stands on something that was not seen."""
         standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
         scene = Scene({}, carriers(graph), graph.T_base_table, graph.support, _eye(graph))
         while standing:
             name = next(name for name in standing if scene.supports[name] not in standing)
-            item = standing.pop(name)
-            scene = scene.after(name, scene.rested(item, scene.supports[name]), scene.supports[name])
+            item, support = standing.pop(name), scene.supports[name]
+            rested = scene.rested(item, support)
+            scene = scene.after(name, item if _hangs(item, rested) else rested, support)
         return scene
+
+    def hangs(self, name: str) -> bool:
+        """Whether an object is above what is said to carry it."""
+        item = self.standing[name]
+        return _hangs(item, self.rested(item, self.supports[name]))
 
     def rested(self, item: Standing, support: str) -> Standing:
         """The object at the height at which its bottom meets the surface below it; one that leans stays."""
@@ -73,6 +82,10 @@ class Scene:
             chain.add(support)
             support = self.supports[support]
         return [item for item in self.standing.values() if item.name not in chain]
+
+
+def _hangs(item: Standing, rested: Standing) -> bool:
+    return item.z_bottom - rested.z_bottom > _HANGS
 
 
 def _eye(graph: SceneGraph) -> Floats | None:

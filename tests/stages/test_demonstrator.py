@@ -734,6 +734,24 @@ def test_what_may_hide_a_missing_object_is_put_aside_before_it_is_given_up() -> 
     assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
 
 
+def test_what_is_in_the_way_of_that_is_put_aside_once() -> None:
+    start = Layout(dict(CARTON.poses)).put("tea_box", 0.2, -0.3)
+    goal = Layout(dict(start.poses) | {"salt_shaker": OPEN})
+    seen = msgspec.structs.replace(start.graph(), support=regions.rectangle([-0.3, -0.4], [0.3, 0.4]))
+    episode = Episode()
+    episode.until_start(goal.graph())
+    blocker = transfer("tea_box", "table", "table")
+    for number in (1, 2):
+        episode.seen(seen, view(start))
+        (task,) = episode.seen(seen, view(start))
+        assert isinstance(task, Task) and task.aside == "milk_carton"
+        answer = episode.planned(blocker)
+        if number == 1:
+            assert isinstance(answer[0], TransferRequest) and answer[0].transfer == blocker
+            episode.ended(1, blocker)
+    assert answer == [LookRequest(purpose="after transfer 1, look 3")]
+
+
 def test_what_slipped_is_tried_again_as_it_was() -> None:
     episode = Episode()
     task = episode.until_task()

@@ -251,6 +251,22 @@ def test_what_a_box_leaves_unexplained_may_be_an_object_by_another_label(
         assert {item.label for item in estimate.objects} == {label, "tea_box"}
 
 
+@pytest.mark.parametrize("x", [0.045, 0.055, 0.065])
+def test_what_covers_the_readings_but_fits_worse_than_the_others_is_tried_by_another_label(
+    x: float, filter_stage: ParticleFilter
+) -> None:
+    """A can behind a box, of which a part shows that a salt shaker covers, too."""
+    partly = {"cereal_box": upright("cereal_box", 0.0, 0.0, np.pi / 2), "soup_can": upright("soup_can", x, 0.09, 0.0)}
+    behind = render(partly)
+    found = candidates(("cereal_box", behind.boxes["cereal_box"], 0.95), ("salt_shaker", behind.boxes["soup_can"], 0.4))
+    doubted = msgspec.structs.replace(found.candidates[1], others=("tuna_can", "soup_can"))
+    found = msgspec.structs.replace(found, candidates=(found.candidates[0], doubted))
+    config = Hypotheses.Config(n_objects="auto")
+    (observation, *hypotheses), _ = enumerate_(config, frame(behind), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert {item.label for item in estimate.objects} == set(partly)
+
+
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))

@@ -488,3 +488,14 @@ def test_what_hides_something_is_put_where_it_hides_nothing_of_that():
         after = executed(current, found, which=which)
         carton = Standing.at("milk_carton", stances("milk_carton"), after.poses["milk_carton"])
         assert hidden_share(behind, [carton], eye) == 0
+
+
+def test_what_keeps_the_hand_from_what_hides_something_is_put_aside_first():
+    current = Layout().put("salt_shaker", 0.05, 0.0)
+    around = {"milk_carton": (-0.04, 0.0), "sugar_box": (0.14, 0.0), "cereal_box": (0.05, 0.1), "tea_box": (0.05, -0.1)}
+    for name, (x, y) in around.items():
+        current.put(name, x, y)
+    goal = Layout(dict(current.poses)).put("cup", 0.2, 0.3)
+    task = Task(goal_name="goal", goal=goal.graph(), current=current.graph(), aside="salt_shaker")
+    (transfer,) = planner().on_task(task, Recorded()).transfers
+    assert transfer.object in around and transfer.destination == "table"

@@ -19,12 +19,14 @@ _LEAST = 0.03
 _TALLEST = 0.6
 _MARGIN = 0.05
 """Metres by which boxes are larger: as much as an uncalibrated camera is off, and what lies in the shadow."""
+_HIGHER = 0.03
+"""Metres by which the table is higher: as much as an uncalibrated camera is off in height."""
 
 
 def occupied(
     depth: Float32s, view: View, T_base_camera: Floats, robot: Robot, rng: np.random.Generator
 ) -> tuple[float, Floats] | None:
-    """The table's height and the boxes on it: N x 6, low and high corner, base frame, metres.
+    """The table's height at most and the boxes on it: N x 6, low and high corner, base frame, metres.
 
     ``depth`` is H x W metres, 0 where there is no reading or the robot is. None where no table is seen where the robot
     works.
@@ -42,7 +44,7 @@ def occupied(
     points = (view.rays() * depth[..., None])[depth > 0] @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
     above = points[:, 2] - height
     on_it = (above > _LEAST) & (above < _TALLEST) & ((points[:, :2] > low) & (points[:, :2] < high)).all(1)
-    return height, _boxes(points[on_it], low, high, height)
+    return height + _HIGHER, _boxes(points[on_it], low, high, height)
 
 
 def _boxes(points: Floats, low: Floats, high: Floats, height: float) -> Floats:

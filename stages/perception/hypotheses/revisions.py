@@ -17,6 +17,8 @@ _EQUAL = 0.01
 """Difference of two such shares that is none."""
 _UNSEEN = 0.01
 """Visible share of an object up to which it explains nothing."""
+_MISFIT = 1.5
+"""How many times as badly as the others (their median) an object fits from which on its label is doubted."""
 _GAIN = 0.01
 """Share of the cost that a round must save for another one to follow."""
 
@@ -60,18 +62,34 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
 def relabelled(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
     """Revisions in which what a box leaves unexplained is an object by another label, in the place of the one that came
     from that box, if there is any; as :func:`revisions`."""
-    chosen = _chosen(best, offers)
-    instead = [k for k in _left_open(best, before) if offers[k].instead and k not in chosen]
-    taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
-    return [
-        Revision(tuple(i for i in range(len(best.objects)) if i not in gone), (k,))
-        for k, gone in zip(instead, taken, strict=True)
-    ]
+    return _instead(best, offers, _left_open(best, before))
+
+
+def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
+    """Revisions in which the object that fits worst has another label: it may cover readings without being alike."""
+    if len(best.objects) < 2:
+        return []
+    *others, worst = sorted(best.objects, key=lambda item: item.cost)
+    if worst.cost < _MISFIT * np.median([item.cost for item in others]):
+        return []
+    doubted = offers[_index(worst, offers)]
+    return _instead(best, offers, [k for k, offer in enumerate(offers) if _same_box(offer, doubted)])
 
 
 def is_better(log_weight: float, known: float) -> bool:
     """Whether a scene saves enough of what the best one before costs."""
     return log_weight > (1 - _GAIN) * known
+
+
+def _instead(best: Posterior, offers: Sequence[Offer], among: Sequence[int]) -> list[Revision]:
+    """Less likely labels among some offers, each in the place of the object that came from its box."""
+    chosen = _chosen(best, offers)
+    instead = [k for k in among if offers[k].instead and k not in chosen]
+    taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
+    return [
+        Revision(tuple(i for i in range(len(best.objects)) if i not in gone), (k,))
+        for k, gone in zip(instead, taken, strict=True)
+    ]
 
 
 def _chosen(best: Posterior, offers: Sequence[Offer]) -> dict[int, int]:

@@ -150,7 +150,7 @@ def test_recordings_are_listed_and_can_be_downloaded(lamp: Lamp) -> None:
 def test_a_person_sees_what_is_told_and_does_what_is_offered(page: Page) -> None:
     expect(page.get_by_text("has blinked 0 times")).to_be_visible()
     expect(page.get_by_role("img", name="A lamp.")).to_be_visible()
-    assert page.evaluate("document.querySelector('figure img').naturalWidth") == 64
+    expect(page.locator("figure img").first).to_have_js_property("naturalWidth", 64)
     expect(page.locator(".picture .name")).to_have_text(
         ["? unknown lamp", "! doubtful lamp", "? unsure lamp", "✓ sure lamp"]
     )
@@ -325,8 +325,9 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     page.goto(f"{page.url.partition('#')[0]}#history/{run}/lamp.blinked#1")
     expect(then).to_contain_text(f"runner why lamp.blinked#1 {run}.mcap")
     expect(then).to_contain_text(f"runner view {run}.mcap --at lamp.blinked#1")
+    (told,) = blinked.findall(then.inner_text())
     page.get_by_label("Language").select_option("de")
-    expect(page.get_by_role("region", name="Damals")).to_contain_text(f"{int(first) + 1}-mal geblinkt")
+    expect(page.get_by_role("region", name="Damals")).to_contain_text(f"{told}-mal geblinkt")
     path = urlsplit(lamp.url).path
     assert [asked(lamp.url, f"{path}runs/{one}")[0] for one in (f"{run}/fr.json", "nothing/en.json")] == [422, 404]
 

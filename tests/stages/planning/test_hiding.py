@@ -1,10 +1,13 @@
 """What may hide an object that is not seen."""
 
 import numpy as np
+import pytest
 
 from stages.geometry import regions
+from stages.geometry.poses import raised
 from stages.planning.hiding import hiders, uncovers
 from stages.planning.placements import Scene
+from stages.planning.problem import TABLE
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, stances
 
@@ -22,21 +25,31 @@ def test_what_is_tall_and_wide_is_looked_behind_first() -> None:
     seen = scene(
         Layout().put("sponge", 0.0, -0.2).put("milk_carton", 0.0, 0.2), {"sponge": "table", "milk_carton": "table"}
     )
-    heights = {"sponge": 0.0, "milk_carton": 0.0}
-    assert hiders([stances("tuna_can")], seen, MOVABLE, heights) == ["milk_carton"]
-    assert hiders([stances("tuna_can")], seen, MOVABLE - {"milk_carton"}, heights) == []
+    assert hiders([stances("tuna_can")], seen, MOVABLE) == ["milk_carton"]
+    assert hiders([stances("tuna_can")], seen, MOVABLE - {"milk_carton"}) == []
 
 
 def test_what_hangs_in_the_air_is_looked_under_first_and_a_stack_from_its_top() -> None:
     layout = Layout().put("sponge", 0.0, -0.2).put("milk_carton", 0.0, 0.2)
-    seen = scene(layout, {"sponge": "table", "milk_carton": "table"})
-    found = hiders([stances("tuna_can")], seen, MOVABLE, {"sponge": 0.035, "milk_carton": 0.0})
-    assert found == ["sponge", "milk_carton"]
-    stacked = scene(
-        layout.put("tuna_can", 0.0, -0.2), {"sponge": "table", "milk_carton": "table", "tuna_can": "sponge"}
-    )
-    heights = {"sponge": 0.035, "milk_carton": 0.0, "tuna_can": 0.07}
-    assert hiders([stances("salt_shaker")], stacked, MOVABLE, heights)[0] == "tuna_can"
+    layout.poses["sponge"] = raised(layout.poses["sponge"], 0.035)
+    assert hiders([stances("tuna_can")], scene(layout, dict.fromkeys(layout.poses, TABLE)), MOVABLE) == [
+        "sponge",
+        "milk_carton",
+    ]
+    layout.put("tuna_can", 0.0, 0.0, on="sponge")
+    stacked = scene(layout, {"sponge": TABLE, "milk_carton": TABLE, "tuna_can": "sponge"})
+    assert hiders([stances("salt_shaker")], stacked, MOVABLE)[0] == "tuna_can"
+
+
+def test_what_hangs_in_the_air_stays_there_with_what_it_carries() -> None:
+    layout = Layout().put("sponge", 0.0, -0.2).put("tuna_can", 0.0, 0.0, on="sponge").put("soup_can", 0.1, 0.2)
+    height = Standing.at("tuna_can", stances("tuna_can"), layout.poses["tuna_can"]).z_bottom
+    raised_by = {"sponge": 0.035, "tuna_can": 0.037, "soup_can": 0.005}
+    lifted = Layout({name: raised(T, raised_by[name]) for name, T in layout.poses.items()})
+    seen = Scene.of(lifted.graph(), {name: stances(name) for name in lifted.poses})
+    assert seen.hangs("sponge") and not seen.hangs("tuna_can") and not seen.hangs("soup_can")
+    assert seen.standing["tuna_can"].z_bottom == pytest.approx(height + 0.035)
+    assert seen.standing["soup_can"].z_bottom == pytest.approx(0.0)
 
 
 def test_what_is_put_aside_uncovers_what_was_behind_it() -> None:

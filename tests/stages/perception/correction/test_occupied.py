@@ -1,0 +1,25 @@
+"""What the arm keeps out of before anybody knows how far the camera is off."""
+
+import numpy as np
+import pytest
+
+from stages.geometry.poses import inverse, pose
+from stages.perception.correction.occupied import occupied
+from tests.stages.perception.scenes import VIEW, camera, render, upright
+from tests.stages.planning.scenes import ROBOT
+
+
+@pytest.mark.parametrize("depth", [0.98, 1.0, 1.02])
+def test_the_table_is_not_lower_and_things_not_smaller_than_they_are(depth: float) -> None:
+    """A camera whose depth is 2 % off, about a metre away."""
+    T_base_table = pose(np.eye(3), np.array([*ROBOT.table.center, ROBOT.table.height]))
+    seen = render({"milk_carton": upright("milk_carton", 0.0, 0.0, 0.0)})
+    T_base_camera = T_base_table @ inverse(camera())
+    found = occupied(
+        (depth * seen.scene.depth).astype(np.float32), VIEW, T_base_camera, ROBOT, np.random.default_rng(0)
+    )
+    assert found is not None
+    height, (box,) = found
+    assert ROBOT.table.height < height < ROBOT.table.height + 0.06
+    low, high = box[:2] - ROBOT.table.center, box[3:5] - ROBOT.table.center
+    assert (low < -0.03).all() and (high > 0.03).all() and box[5] > ROBOT.table.height + 0.15
