@@ -533,7 +533,9 @@ class Demonstrator(Stage):
             why = self._state.complaint or f"{violated[0]} does not hold"
             return self._fail("executor", f"{self._state.transfers} transfers were not enough; {why}", ctx)
         self._state = replace(self._state, phase=Phase.PLANNING)
-        return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided())
+        ahead = () if self._state.complaint else self._state.remainder
+        then = tuple(action for transfer in ahead for action in (transfer.pick, transfer.place))
+        return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided(), then=then)
 
     def _check_transfer(self, scene: SceneGraph, ctx: Context) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan.

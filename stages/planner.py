@@ -21,6 +21,7 @@ from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
 from stages.planning.problem import TABLE, Problem, cycle, wanted
 from stages.planning.search import Solution, Step
+from stages.planning.stepwise import stepwise
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
@@ -130,23 +131,32 @@ class Planner(Stage):
         text = problem_pddl(task.goal_name, problem, task.current, task.goal)
         if not violated:
             return _answer("satisfied", text)
+        if (steps := search.continued(task.then, problem)) and task.goal is taught:
+            poses = self._targets(problem, task, taught, ctx).of(steps, self._scene(task), late=problem.items)
+            if isinstance(poses, list):
+                return _solved(zip(steps, poses, strict=True), text, problem)
         try:
             self._check(problem, task)
             return self._solve_with_room(problem, task, taught, ctx)
         except Impossible as reason:
             refused, blocked = _answer("refused", text, reason=str(reason)), reason.blocked
-        if task.goal is not taught or blocked is None or blocked.step.parent not in blocked.obstacles:
+        if task.goal is not taught or blocked is None:
             return refused
-        if not problem.graspable.issuperset(problem.beside(blocked.step.item)):
-            return refused
-        ctx.log(f"{refused.reason}; places {blocked.step.item} first")
-        plan = self._plan(replace_fields(task, goal=rerooted(taught, blocked.step.item)), taught, ctx)
-        return plan if plan.status == "solved" else refused
+        beside = problem.graspable.issuperset(problem.beside(blocked.step.item))
+        if blocked.step.parent in blocked.obstacles and beside:
+            ctx.log(f"{refused.reason}; places {blocked.step.item} first")
+            plan = self._plan(replace_fields(task, goal=rerooted(taught, blocked.step.item)), taught, ctx)
+            if plan.status == "solved":
+                return plan
+        ctx.log(f"{refused.reason}; plans one transfer after the other")
+        targets = self._targets(problem, task, taught, ctx)
+        steps = stepwise(problem, targets, self._scene(task), ctx.rng, avoided=task.avoid)
+        return refused if steps is None else _solved(steps, text, problem)
 
     def _put_aside(self, task: Task, ctx: Context) -> Plan:
         """One transfer, to a place on the table where the object hides nothing of what it hides now; of what keeps the
         hand from it, where something does."""
-        scene = Scene.of(task.current, self._stances)
+        scene = self._scene(task)
         workspace = replace(self._config.workspace, targets=_ASIDE)
         handling = self._handling(self._robot, self._robot.table, ctx.rng)
         targets = Targets(Placements(task.current, self._stances, task.current), workspace, self._robot, handling, {})
@@ -220,7 +230,7 @@ class Planner(Stage):
 
     def _solve_with_room(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
-        scene = Scene.of(task.current, self._stances)
+        scene = self._scene(task)
         beside = {
             (neighbour, item, destination)
             for item, destination in (_moved(key) for key in task.avoid)
@@ -234,12 +244,7 @@ class Planner(Stage):
 
     def _solve(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
-        current = Scene.of(task.current, self._stances)
-        handling = self._handling(self._robot, self._robot.table, ctx.rng, problem.faced)
-        placements = Placements(task.goal, self._stances, taught)
-        # What may be anywhere is turned on the table.
-        goal = dict.fromkeys(problem.faced, TABLE) | wanted(task.goal)
-        targets = Targets(placements, self._config.workspace, self._robot, handling, goal)
+        current, targets = self._scene(task), self._targets(problem, task, taught, ctx)
         avoided = frozenset(task.avoid)
         blocked: Blocked | None = None
         attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
@@ -254,14 +259,24 @@ class Planner(Stage):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
                 continue
             if not isinstance(poses, Blocked):
-                transfers = [_transfer(*pair, attempt.problem) for pair in zip(solution.steps, poses, strict=True)]
-                return _answer("solved", text, transfers=transfers, expanded=solution.expanded)
+                steps = zip(solution.steps, poses, strict=True)
+                return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, solution.steps)
             if following is None:
                 break
             ctx.log(f"{_no_room(blocked)}; looks for another way")
             attempt = following
         raise Impossible(_no_room(blocked) if blocked else "no order of transfers leaves room for the hand", blocked)
+
+    def _scene(self, task: Task) -> Scene:
+        return Scene.of(task.current, self._stances)
+
+    def _targets(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Targets:
+        handling = self._handling(self._robot, self._robot.table, ctx.rng, problem.faced)
+        placements = Placements(task.goal, self._stances, taught)
+        # What may be anywhere is turned on the table.
+        goal = dict.fromkeys(problem.faced, TABLE) | wanted(task.goal)
+        return Targets(placements, self._config.workspace, self._robot, handling, goal)
 
     def _search(self, attempt: Attempt, text: str) -> Solution:
         if self._config.engine == search.BFS:
@@ -280,6 +295,11 @@ def _transfer(step: Step, T_base_targets: Floats, problem: Problem) -> Transfer:
         place=place,
         faces=step.item in problem.faced,
     )
+
+
+def _solved(steps: Iterable[tuple[Step, Floats]], text: str, problem: Problem, *, expanded: int = 0) -> Plan:
+    transfers = [_transfer(step, poses, problem) for step, poses in steps]
+    return _answer("solved", text, transfers=transfers, expanded=expanded)
 
 
 def _answer(

@@ -16,6 +16,7 @@ from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import doubts
 from stages.scene.relations import Tolerances
 from stages.scene.stance import Stances, Standing
+from stages.scene.text import SURE
 
 
 class SceneGraphBuilder(Stage):
@@ -54,7 +55,13 @@ class SceneGraphBuilder(Stage):
             for item in found
         ]
         supports = relations.supports(standing, self._config.tolerances)
-        regions = virtual.virtual_objects(standing, supports, gap=self._config.gap, radius=self._config.radius)
+        regions = virtual.virtual_objects(
+            standing,
+            supports,
+            gap=self._config.gap,
+            radius=self._config.radius,
+            doubtful={item.name for item in found if item.probability is not None and item.probability < SURE},
+        )
         T_base_camera = scene_estimate.T_base_camera if scene_estimate.T_base_camera is not None else T_table_camera
         return SceneGraph(
             objects=self._objects(found, T_base_camera),

@@ -44,6 +44,8 @@ class Task(Message, frozen=True, kw_only=True):
     """Transfers that failed and should not be tried the same way again (``Transfer.key``)."""
     aside: str = ""
     """An object to be put elsewhere first, to see what it hides; nothing else is asked for then."""
+    then: tuple[str, ...] = ()
+    """What the plan before still had to do, as symbolic actions. Where that still leads to the goal, it is the plan."""
 
 
 class Transfer(Struct, frozen=True, kw_only=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from runner.contract import Refused
@@ -52,9 +52,8 @@ def breadth_first(problem: Problem, *, reluctant: Collection[str] = ()) -> Solut
     where it finally belongs, it is the only one followed: that item has to make that move sometime, and making it
     now is in nobody's way.
     """
-    order = sorted(problem.items, key=lambda item: item in reluctant)
-    start: State = (tuple(problem.supports.values()), problem.held, problem.obstructions, problem.turned)
-    search = _Search(problem, tuple(order))
+    search = Moves(problem, sorted(problem.items, key=lambda item: item in reluctant))
+    start = search.start
     parents: dict[State, tuple[State, Step] | None] = {start: None}
     frontier, expanded = [start], 0
     while frontier:
@@ -63,7 +62,7 @@ def breadth_first(problem: Problem, *, reluctant: Collection[str] = ()) -> Solut
             if search.reached(state):
                 return Solution(_path(parents, state), expanded)
             expanded += 1
-            for step, successor in search.moves(state):
+            for step, successor in search.worthwhile(state):
                 if successor not in parents:
                     parents[successor] = (state, step)
                     following.append(successor)
@@ -79,10 +78,11 @@ def _path(parents: dict[State, tuple[State, Step] | None], state: State) -> tupl
     return tuple(reversed(steps))
 
 
-class _Search:
+class Moves:
     """What follows from a state."""
 
-    def __init__(self, problem: Problem, order: tuple[str, ...]) -> None:
+    def __init__(self, problem: Problem, order: Sequence[str]) -> None:
+        """``order``: of the items, as moves are listed."""
         self._problem = problem
         self._movable = [item for item in order if item in problem.graspable]
         self._index = {item: i for i, item in enumerate(problem.items)}
@@ -95,19 +95,45 @@ class _Search:
         placed = all(supports[self._index[item]] == support for item, support in problem.goal.items())
         return placed and held >= problem.regions.keys() and problem.clear.isdisjoint(supports) and not turned
 
-    def moves(self, state: State) -> list[tuple[Step, State]]:
+    @property
+    def start(self) -> State:
+        """The state in which the problem begins."""
+        problem = self._problem
+        return tuple(problem.supports.values()), problem.held, problem.obstructions, problem.turned
+
+    def worthwhile(self, state: State) -> list[tuple[Step, State]]:
         """The moves worth following: the first that is final, or else all."""
         found: list[tuple[Step, State]] = []
-        for item in self._movable:
-            if item in state[0] or self._settled(item, state):  # Something rests on it, or it may stay.
-                continue
-            for step, successor in self._moves_of(item, state):
+        for item in self._free(state):
+            for step, successor in self.of(item, state):
                 if self._settled(item, successor):
                     return [(step, successor)]
                 found.append((step, successor))
         return found
 
-    def _moves_of(self, item: str, state: State) -> Iterator[tuple[Step, State]]:
+    def final(self, state: State) -> list[tuple[Step, State]]:
+        """All moves after which an item is where it belongs for good."""
+        moves = (move for item in self._free(state) for move in self.of(item, state))
+        return [move for move in moves if self._settled(move[0].item, move[1])]
+
+    def aside(self, item: str, state: State) -> tuple[Step, State]:
+        """The move of one item to anywhere on the table, where it shows any side."""
+        moves = (move for move in self.of(item, state) if move[0].destination == TABLE and not move[0].region)
+        step, (supports, held, obstructions, _) = next(moves)
+        return step, (supports, held, obstructions, state[3])
+
+    def pending(self, state: State) -> list[str]:
+        """Items of the goal that cannot stay, and what may not stay on one."""
+        supports, goal = state[0], self._problem.goal
+        away = [item for item in self._movable if not self._settled(item, state)]
+        return [item for item in away if item in goal or supports[self._index[item]] in self._problem.clear]
+
+    def _free(self, state: State) -> list[str]:
+        """Items on which nothing rests and that cannot stay."""
+        return [item for item in self._movable if item not in state[0] and not self._settled(item, state)]
+
+    def of(self, item: str, state: State) -> Iterator[tuple[Step, State]]:
+        """The moves of one item."""
         supports, held, obstructions, turned = state
         at, regions = self._index[item], self._problem.regions
         held -= {child for child in held if child == item or regions[child].parent == item}
@@ -182,11 +208,32 @@ def with_engine(engine: str, problem_pddl: str, problem: Problem) -> Solution:
     return Solution(tuple(_steps(ground, problem)), 0)
 
 
-def _steps(ground: list[tuple[str, ...]], problem: Problem) -> Iterator[Step]:
+def _steps(ground: Sequence[tuple[str, ...]], problem: Problem) -> Iterator[Step]:
     """Pairs of ground actions, a pick and the place that follows it, as steps."""
     names = {symbol(name): name for name in (TABLE, *problem.items)}
+    regions = {symbol(region.name): region for region in problem.regions.values()}
     for (_, item, source), (_, _, *where) in zip(ground[::2], ground[1::2], strict=True):
-        at_region = len(where) == 3
-        region = problem.regions[names[item]] if at_region else None
+        region = regions[where[0]] if len(where) == 3 else None
         beside = (region.name, region.parent) if region else ()
         yield Step(names[item], names[source], names[where[-1]], *beside)
+
+
+def continued(ground: Sequence[str], problem: Problem) -> tuple[Step, ...]:
+    """The steps of a plan's remaining actions where these lead to the goal from here, else none."""
+    try:
+        steps = tuple(_steps([tuple(action.strip("()").split()) for action in ground], problem))
+    except KeyError:  # An object is gone, or a region is told otherwise.
+        return ()
+    return steps if leads_home(steps, problem) else ()
+
+
+def leads_home(steps: Iterable[Step], problem: Problem) -> bool:
+    """Whether the steps can be done one after the other, and the goal holds then."""
+    moves = Moves(problem, problem.items)
+    state = moves.start
+    for step in steps:
+        after = dict(moves.of(step.item, state)) if step.item not in state[0] else {}
+        if step not in after:
+            return False
+        state = after[step]
+    return moves.reached(state)

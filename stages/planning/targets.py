@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, takewhile
 from math import hypot
 from typing import TYPE_CHECKING
 
@@ -120,6 +120,16 @@ class Crowded:
     step: Step
 
 
+@dataclass(frozen=True)
+class Next:
+    """A step that can be done."""
+
+    T_base_targets: Floats
+    """N x 4 x 4, best first."""
+    scene: Scene
+    """As it is after the step, at the first of the targets."""
+
+
 Found = tuple[list[Placement], tuple[str, ...]]
 """Places that are free, best first, and the fewest objects that take up another one."""
 
@@ -158,6 +168,32 @@ class Targets:
         Steps ``again`` failed before with the best poses and get those that come next. Items that are ``late``
         already may crowd others.
         """
+        found = self._chosen(steps, scene, again, late)
+        return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]
+
+    def next(
+        self, step: Step, rest: Sequence[Step], scene: Scene, *, again: bool, late: bool
+    ) -> Next | Blocked | Crowded:
+        """One step's targets and the scene after it, whatever becomes of the ``rest``."""
+        options = self._options(step, rest, scene, again)
+        if isinstance(options, Blocked):
+            return options
+        number = next(options.handled.places(), None)
+        if number is None:
+            return _trouble(step, options, None)
+        chosen = options.places[number]
+        if not late and self._crowds(chosen, rest, scene):
+            return Crowded(step)
+        targets = self._targets(options.places[number : number + self._workspace.targets], scene)
+        return Next(targets, scene.after(step.item, chosen, step.destination))
+
+    def _targets(self, places: Sequence[Standing], scene: Scene) -> Floats:
+        return np.stack([scene.T_base_table @ item.T_table_object for item in places])
+
+    def _chosen(
+        self, steps: Sequence[Step], scene: Scene, again: Collection[Step], late: Collection[str]
+    ) -> list[list[Standing]] | Blocked | Crowded:
+        """Places of every step, best first: one that leads on, and others that leave room for what comes after it."""
         if not steps:
             return []
         step, *rest = steps
@@ -169,14 +205,28 @@ class Targets:
             self._tries -= 1
             if step.item not in late and self._crowds(places[number], rest, scene):
                 return Crowded(step)
-            onward = self.of(rest, scene.after(step.item, places[number], step.destination), again=again, late=late)
+            onward = self._chosen(rest, scene.after(step.item, places[number], step.destination), again, late)
             if isinstance(onward, list):
-                best = places[number : max(self._workspace.targets, number + FEWEST)]
-                return [np.stack([scene.T_base_table @ item.T_table_object for item in best]), *onward]
+                offered = places[number : max(self._workspace.targets, number + FEWEST)]
+                return [self._harmless(offered, rest, scene, [one[0] for one in onward]), *onward]
             failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
                 break
         return _trouble(step, options, failed)
+
+    def _harmless(
+        self, places: Sequence[Standing], rest: Sequence[Step], scene: Scene, later: Sequence[Standing]
+    ) -> list[Standing]:
+        """The first place, and those others that are in the way of nothing that comes while the object is there."""
+        first, *others = places
+        meanwhile = list(takewhile(lambda item: item.name != first.name, later))
+        crowds = self._crowds(first, rest, scene)
+
+        def leads_on(place: Standing) -> bool:
+            blocks = any(_is_near(place, item, self._workspace.clearance) for item in meanwhile)
+            return not blocks and (crowds or not self._crowds(place, rest, scene))
+
+        return [first, *filter(leads_on, others)]
 
     def _options(self, step: Step, rest: Sequence[Step], scene: Scene, again: bool) -> Options | Blocked:
         """What the same step in the same scene had before, or what is found now."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -21,18 +21,26 @@ SYMMETRY_STEP = np.deg2rad(4)
 
 
 def virtual_objects(
-    standing: Sequence[Standing], found: Mapping[str, Support], *, gap: float, radius: float
+    standing: Sequence[Standing],
+    found: Mapping[str, Support],
+    *,
+    gap: float,
+    radius: float,
+    doubtful: Collection[str] = (),
 ) -> tuple[VirtualObject, ...]:
     """A region for each pair of neighbours: same supporter, footprints less than ``gap`` metres apart.
 
     The neighbours of a supporter form a graph; its minimum spanning forest keeps the relations few and free of
     cycles. In each tree an object that cannot be moved, then the one with the largest footprint, is the root, and
     every other object belongs into a region of its neighbour towards the root. So each object has one parent.
+
+    A region turns with its parent. Objects whose pose is ``doubtful`` are therefore parents only where nothing else
+    joins their neighbours.
     """
     made: list[VirtualObject] = []
     for supporter in dict.fromkeys(support.parent for support in found.values()):
         siblings = [item for item in standing if found[item.name].parent == supporter]
-        made += [_region(parent, child, radius) for parent, child in _tree(siblings, gap)]
+        made += [_region(parent, child, radius) for parent, child in _tree(siblings, gap, doubtful)]
     return tuple(made)
 
 
@@ -46,12 +54,12 @@ def _region(parent: Standing, child: Standing, radius: float) -> VirtualObject:
     )
 
 
-def _tree(siblings: Sequence[Standing], gap: float) -> list[tuple[Standing, Standing]]:
+def _tree(siblings: Sequence[Standing], gap: float, doubtful: Collection[str]) -> list[tuple[Standing, Standing]]:
     """(parent, child) pairs of the minimum spanning forest, parents first."""
-    edges = _spanning(siblings, gap)
+    edges = _spanning(siblings, gap, doubtful)
     pairs: list[tuple[Standing, Standing]] = []
     reached: set[str] = set()
-    for root in sorted(siblings, key=_root_first):
+    for root in sorted(siblings, key=lambda item: _root_first(item, item.name in doubtful)):
         pending = [] if root.name in reached else [root]
         reached.add(root.name)
         while pending:
@@ -63,18 +71,20 @@ def _tree(siblings: Sequence[Standing], gap: float) -> list[tuple[Standing, Stan
     return pairs
 
 
-def _root_first(item: Standing) -> tuple[bool, float, str]:
+def _root_first(item: Standing, doubtful: bool) -> tuple[bool, bool, float, str]:
     area = regions.area(item.stance.outline)
-    return bool(item.stance.item.grasps), -area, item.name
+    return bool(item.stance.item.grasps), doubtful, -area, item.name
 
 
-def _spanning(siblings: Sequence[Standing], gap: float) -> set[frozenset[str]]:
-    """Kruskal's minimum spanning forest over the gaps between footprints; ties go by name."""
-    pairs = [(a, b) for i, a in enumerate(siblings) for b in siblings[i + 1 :]]
-    edges = sorted((regions.gap(a.outline, b.outline), *sorted((a.name, b.name))) for a, b in pairs)
+def _spanning(siblings: Sequence[Standing], gap: float, doubtful: Collection[str]) -> set[frozenset[str]]:
+    """Kruskal's minimum spanning forest over the gaps between footprints, sure neighbours first; ties go by name."""
+    pairs = [sorted((a, b), key=lambda item: item.name) for i, a in enumerate(siblings) for b in siblings[i + 1 :]]
+    edges = sorted(
+        (a.name in doubtful or b.name in doubtful, regions.gap(a.outline, b.outline), a.name, b.name) for a, b in pairs
+    )
     component = {item.name: item.name for item in siblings}
     chosen: set[frozenset[str]] = set()
-    for distance, a, b in edges:
+    for _, distance, a, b in edges:
         if distance >= gap or component[a] == component[b]:
             continue
         chosen.add(frozenset((a, b)))

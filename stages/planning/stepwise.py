@@ -1,0 +1,157 @@
+"""Plans made one transfer after the other, each in the scene that those before it leave behind.
+
+The search of :mod:`stages.planning.search` finds the fewest transfers, and learns of room only from steps that had
+none: what it learns it never forgets, and in dense scenes that may rule out every order. Here an object that can go
+where it belongs goes there; where none can, what is in the way of one is put aside, and waits until that one has
+moved. What ends nowhere begins again in another order. Such plans make detours, so each step is left out that the rest
+can do without; they may still be longer than they need be.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stages.geometry.arrays import Floats
+from stages.planning.placements import Scene
+from stages.planning.problem import TABLE, Problem
+from stages.planning.search import Moves, State, Step, leads_home
+from stages.planning.targets import Blocked, Crowded, Next, Targets, neighbours
+
+_STARTS = 6
+"""Orders that are tried, the first as the objects are listed."""
+_ASIDE = 2
+"""Times that one object is put aside."""
+
+
+def stepwise(
+    problem: Problem, targets: Targets, scene: Scene, rng: np.random.Generator, *, avoided: Collection[str] = ()
+) -> list[tuple[Step, Floats]] | None:
+    """Steps with their T_base_targets, N x 4 x 4 each; None where no order leads to the goal.
+
+    Transfers with ``avoided`` keys failed before and get other targets.
+    """
+    order = list(problem.items)
+    for _ in range(_STARTS):
+        way = _Way(Moves(problem, order), problem, targets, scene, avoided)
+        if way.leads_home():
+            return _shortened(way.steps, problem, targets, scene)
+        rng.shuffle(order)
+    return None
+
+
+def _shortened(
+    steps: Sequence[tuple[Step, Floats]], problem: Problem, targets: Targets, scene: Scene
+) -> list[tuple[Step, Floats]]:
+    """The same without steps that the others can do without."""
+    best, k = list(steps), 0
+    while k < len(best):
+        fewer = _without([step for step, _ in best], k)
+        poses = targets.of(fewer, scene, late=problem.items) if leads_home(fewer, problem) else None
+        if isinstance(poses, list):
+            best = list(zip(fewer, poses, strict=True))
+        else:
+            k += 1
+    return best
+
+
+def _without(steps: Sequence[Step], k: int) -> list[Step]:
+    """Steps without one of them; the next of its object begins where it did."""
+    rest = [*steps[:k], *steps[k + 1 :]]
+    after = next((i for i in range(k, len(rest)) if rest[i].item == steps[k].item), None)
+    if after is not None:
+        rest[after] = replace(rest[after], source=steps[k].source)
+    return rest
+
+
+class _Way:
+    """One way forward."""
+
+    def __init__(
+        self, moves: Moves, problem: Problem, targets: Targets, scene: Scene, avoided: Collection[str]
+    ) -> None:
+        self.steps: list[tuple[Step, Floats]] = []
+        self._moves, self._problem, self._targets, self._avoided = moves, problem, targets, avoided
+        self._state, self._scene = moves.start, scene
+        self._asides: Counter[str] = Counter()
+        self._waits: dict[str, str] = {}
+        """What was put aside -> the object for which it was."""
+
+    def leads_home(self) -> bool:
+        """Goes on until the goal is reached, or nothing can be moved any more."""
+        while not self._moves.reached(self._state):
+            blocked = self._go_home()
+            if blocked is not None and not self._put_aside(blocked):
+                return False
+        return True
+
+    def _go_home(self) -> list[Blocked] | None:
+        """Takes the first object home that can go there, at best in nobody's way; else what all are blocked by."""
+        final = [move for move in self._moves.final(self._state) if move[0].item not in self._waits]
+        blocked: list[Blocked] = []
+        for late in (False, True):
+            for step, after in final:
+                others = [item for item in self._moves.pending(self._state) if item != step.item]
+                found = self._next(step, others, late=late)
+                if isinstance(found, Next):
+                    self._go(step, after, found)
+                    return None
+                if isinstance(found, Blocked):
+                    blocked.append(found)
+        return blocked
+
+    def _put_aside(self, blocked: Sequence[Blocked]) -> bool:
+        """Puts the first object aside that can be: what is in the way, what is in the way of that, what must move."""
+        pending = self._moves.pending(self._state)
+        ahead = [(name, one.step.item) for one in blocked for name in self._in_the_way(one)]
+        ahead += [(name, name) for name in pending]
+        tried: set[str] = set()
+        while ahead:
+            below, other = ahead.pop(0)
+            name = self._uppermost(below)
+            if name in tried or name not in self._problem.graspable or self._asides[name] == _ASIDE:
+                continue
+            tried.add(name)
+            step, after = self._moves.aside(name, self._state)
+            found = self._next(step, [*pending, name], late=True)
+            if isinstance(found, Next):
+                self._go(step, after, found)
+                self._asides[name] += 1
+                if other != name:
+                    self._waits[name] = other
+                return True
+            if isinstance(found, Blocked):
+                ahead = [*((obstacle, name) for obstacle in self._in_the_way(found)), *ahead]
+        return False
+
+    def _go(self, step: Step, after: State, found: Next) -> None:
+        self.steps.append((step, found.T_base_targets))
+        self._state, self._scene = after, found.scene
+        self._waits = {item: other for item, other in self._waits.items() if other != step.item}
+
+    def _next(self, step: Step, pending: Sequence[str], *, late: bool) -> Next | Blocked | Crowded:
+        again = f"{step.item}: {step.source} -> {step.destination}" in self._avoided
+        rest = [self._home_of(item) for item in pending]
+        return self._targets.next(step, rest, self._scene, again=again, late=late)
+
+    def _home_of(self, item: str) -> Step:
+        """The step that takes an item to where it belongs."""
+        region = self._problem.regions.get(item)
+        beside = (region.name, region.parent) if region else ()
+        return Step(item, self._scene.supports[item], self._problem.goal.get(item, TABLE), *beside)
+
+    def _in_the_way(self, blocked: Blocked) -> Sequence[str]:
+        """What a step is blocked by. A region in which there is no room goes with what it is beside; where nothing is
+        known, it may be what stands beside the object."""
+        step = blocked.step
+        parent = [step.parent] if step.region and not blocked.why else []
+        return blocked.obstacles or parent or neighbours(step.item, self._scene)
+
+    def _uppermost(self, name: str) -> str:
+        """What has to be moved first to move an object: it, or what rests on it."""
+        while above := sorted(item for item, support in self._scene.supports.items() if support == name):
+            name = above[0]
+        return name
