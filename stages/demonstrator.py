@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import islice
 from math import pi
 from pathlib import Path
 from typing import Literal
@@ -48,14 +49,17 @@ from stages.planning.placements import Scene
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import corrected, open_doubt
+from stages.scene.doubts import corrected, open_doubt, which
 from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
+from stages.scene.naming import exchanges
 from stages.scene.relations import Tolerances, hanging
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
+_EXCHANGES = 200
+"""Ways to name equal objects that are compared."""
 _WRONG_SIDE = "is not seen to show the side that it should"
 
 
@@ -303,6 +307,8 @@ class Demonstrator(Stage):
             self._state = replace(state, phase=Phase.ASKING, question=question, shown=shown, asked=question.number)
             yield question
             return
+        if state.goal is not None and not state.known:
+            scene_graph = self._exchanged(scene_graph, state.goal)
         scene = self._memory.complete(scene_graph, self._state.known, observation)
         seen, ahead = self._state.seen | _names(scene_graph), self._state.views[1:]
         self._state = replace(
@@ -485,6 +491,16 @@ class Demonstrator(Stage):
             return known
         placed = msgspec.structs.replace(known[outcome.object], T_base_object=outcome.T_base_object)
         return {**known, outcome.object: placed}
+
+    def _exchanged(self, scene: SceneGraph, goal: SceneGraph) -> SceneGraph:
+        """Equal objects with the names with which most of the goal holds already; which of them is which is no matter,
+        unless somebody is there who is asked."""
+        if self._state.ask and which(scene, goal):
+            return scene
+        labels, names = [item.label for item in scene.objects], [item.name for item in scene.objects]
+        ways = islice(exchanges(labels, names, {item.name: item.label for item in goal.objects}), _EXCHANGES)
+        scenes = [scene, *(self._memory.renamed(scene, way) for way in ways)]
+        return max(scenes, key=lambda one: len(satisfied(goal, one, self._catalogue)[0]))
 
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""

@@ -56,11 +56,11 @@ def stance(T_camera_table: Floats, T_camera_object: Floats) -> Stance:
 
 def open_doubt(scene: SceneGraph, goal: SceneGraph | None, answers: Mapping[str, str]) -> Doubt | None:
     """The first doubt of a scene that nobody has settled; ``goal`` is what is to be restored."""
-    found = [*_which(scene, goal), *scene.doubts] if goal else scene.doubts
+    found = [*which(scene, goal), *scene.doubts] if goal else scene.doubts
     return next((doubt for doubt in found if doubt.key not in answers), None)
 
 
-def _which(scene: SceneGraph, goal: SceneGraph) -> Sequence[Doubt]:
+def which(scene: SceneGraph, goal: SceneGraph) -> Sequence[Doubt]:
     """Objects of which the goal has one of a kind, and the scene several."""
     wanted, there = _by_label(goal), _by_label(scene)
     return [

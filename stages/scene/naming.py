@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, permutations, product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -54,3 +54,21 @@ def names_kept(labels: Sequence[str], places: Floats, known: Mapping[str, Named]
             if apart[row, column] < _STAYED:
                 names[mine[row]] = theirs[column]
     return names
+
+
+def exchanges(labels: Sequence[str], names: Sequence[str], wanted: Mapping[str, str]) -> Iterator[list[str]]:
+    """Every way to name objects of which equal ones are exchangeable.
+
+    Those of a label take the names ``wanted`` for it (name -> label), and beyond these their own.
+    """
+    groups = {label: [i for i, other in enumerate(labels) if other == label] for label in labels}
+    pools = {label: [name for name, other in wanted.items() if other == label] for label in groups}
+    for label, mine in groups.items():
+        spare = [names[i] for i in mine if names[i] not in pools[label]]
+        pools[label] += spare[: max(0, len(mine) - len(pools[label]))]
+    for chosen in product(*(permutations(pools[label], len(mine)) for label, mine in groups.items())):
+        named = [*names]
+        for mine, order in zip(groups.values(), chosen, strict=True):
+            for i, name in zip(mine, order, strict=True):
+                named[i] = name
+        yield named

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 from typing import Literal
 
 import msgspec
@@ -16,7 +15,7 @@ from stages.geometry.poses import inverse
 from stages.messages import Assertion, Goal, Outcome, SceneGraph, Snapshot, Verdict, VirtualObject
 from stages.messages.scene import SceneObject
 from stages.scene.catalogue import Catalogue
-from stages.scene.naming import unique_names
+from stages.scene.naming import exchanges, unique_names
 from stages.scene.relations import Tolerances, assertions, supports
 from stages.scene.scoring import label_of, matched
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
@@ -103,16 +102,8 @@ class Truth:
     def _exchanged(self, final: Snapshot) -> Iterator[Snapshot]:
         """The scene with every way to name its equal objects, as it is first."""
         labels = [label_of(name, self._catalogue) for name in final.names]
-        groups = [
-            [name for name, other in zip(final.names, labels, strict=True) if other == label] for label in set(labels)
-        ]
-        for orders in product(*map(permutations, groups)):
-            new = {
-                old: name
-                for group, order in zip(groups, orders, strict=True)
-                for old, name in zip(group, order, strict=True)
-            }
-            yield msgspec.structs.replace(final, names=tuple(new[name] for name in final.names))
+        for names in exchanges(labels, final.names, {}):
+            yield msgspec.structs.replace(final, names=tuple(names))
 
     def _scene(self, snapshot: Snapshot, taught: SceneGraph) -> SceneGraph:
         """The true scene graph; what left the table does not exist in it."""

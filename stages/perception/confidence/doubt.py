@@ -28,6 +28,8 @@ from stages.scene.catalogue import Catalogue
 
 _PLANE = 0.02
 """Metres from the plane within which a reading that is no foreground is the plane's."""
+_IN_ONE_PLACE = 0.015
+"""Metres that two equal objects reach into each other where they are one that was found twice."""
 _OFF = 0.012
 """Metres along the ray, at one metre, beyond which a reading does not lie on a surface; grows with the square of depth
 as the noise of triangulation does."""
@@ -124,7 +126,7 @@ class Judge:
         layers = self.layers(scene, objects)
         found = self.evidence(scene, objects, layers, float(probabilities[winner]))
         doubts = tuple(_doubt(*each, self._calibration) for each in found)
-        return SceneDoubt(probabilities, doubts, unknown_regions(scene, layers))
+        return SceneDoubt(probabilities, _once(objects, doubts), unknown_regions(scene, layers))
 
     def evidence(
         self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
@@ -157,6 +159,21 @@ def _doubt(evidence: Evidence, others: Others, constants: Calibration) -> PoseDo
     shares *= min(1.0, (1.0 - probability) / max(float(shares.sum()), 1e-9))
     contradicted = is_contradicted(evidence.looked_through)
     return PoseDoubt(evidence, probability, others.poses, tuple(shares.tolist()), contradicted)
+
+
+def _once(objects: Sequence[Judged], doubts: Sequence[PoseDoubt]) -> tuple[PoseDoubt, ...]:
+    """Of two equal objects that are each other's deepest neighbour, and deep, the less probable one cannot be there."""
+
+    def doubled(i: int) -> bool:
+        return objects[i].penetration > _IN_ONE_PLACE and any(
+            other.label == objects[i].label
+            and other.penetration == objects[i].penetration
+            and doubts[k].probability > doubts[i].probability
+            for k, other in enumerate(objects)
+            if k != i
+        )
+
+    return tuple(replace(doubt, contradicted=doubt.contradicted or doubled(i)) for i, doubt in enumerate(doubts))
 
 
 def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> NDArray[np.bool_]:

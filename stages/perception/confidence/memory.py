@@ -16,6 +16,7 @@ from stages.perception.filter.likelihood import ObservedScene, Shape
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue
+from stages.scene.naming import Named, names_kept, unique_names
 from stages.scene.stance import Stances, standing_of
 
 _TRIANGLES = 500
@@ -39,10 +40,11 @@ class Memory:
 
         A stranger at such an object's place is the object, taken for something else because little of it shows.
         """
+        if observation.T_base_camera is None:
+            return scene
+        scene = self._named(scene, known)
         seen = {item.name for item in scene.objects}
         missing = [item for name, item in known.items() if name not in seen]
-        if not missing or observation.T_base_camera is None:
-            return scene
         strangers = [item for item in scene.objects if item.name not in known]
         kept, taken = list[SceneObject](), set[str]()
         for item in missing:
@@ -54,6 +56,24 @@ class Memory:
         if not kept:
             return scene
         return self.related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
+
+    def _named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
+        """Equal objects with the names of those that are known where they stand: who moved one knows where it went."""
+        labels = [item.label for item in scene.objects]
+        equal = {label for label in labels if labels.count(label) > 1}
+        if not equal or not known:
+            return scene
+        before = {name: Named(item.label, item.T_base_object[:3, 3]) for name, item in known.items()}
+        kept = names_kept(labels, np.stack([item.T_base_object[:3, 3] for item in scene.objects]), before)
+        kept = [name if item.label in equal else item.name for item, name in zip(scene.objects, kept, strict=True)]
+        return self.renamed(scene, unique_names(labels, kept))
+
+    def renamed(self, scene: SceneGraph, names: Sequence[str]) -> SceneGraph:
+        """The same scene, its objects with these names."""
+        if all(item.name == name for item, name in zip(scene.objects, names, strict=True)):
+            return scene
+        pairs = zip(scene.objects, names, strict=True)
+        return self.related(scene, [msgspec.structs.replace(item, name=name) for item, name in pairs])
 
     def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
         view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
