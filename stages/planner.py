@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,8 +50,6 @@ class Attempt:
 
     problem: Problem
     reluctant: frozenset[str]
-    avoided: frozenset[str]
-    """Keys of transfers that failed before."""
 
     def after(self, blocked: Blocked, steps: Sequence[Step]) -> Attempt | None:
         """The attempt that makes room for a step, or None where nothing is left to try.
@@ -132,7 +130,8 @@ class Planner(Stage):
         if not violated:
             return _answer("satisfied", text)
         if (steps := search.continued(task.then, problem)) and task.goal is taught:
-            poses = self._targets(problem, task, taught, ctx).of(steps, self._scene(task), late=problem.items)
+            targets, again = self._targets(problem, task, taught, ctx), _failed_before(steps, task.avoid)
+            poses = targets.of(steps, self._scene(task), again=again, late=problem.items)
             if isinstance(poses, list):
                 return _solved(zip(steps, poses, strict=True), text, problem)
         try:
@@ -245,15 +244,14 @@ class Planner(Stage):
     def _solve(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
         current, targets = self._scene(task), self._targets(problem, task, taught, ctx)
-        avoided = frozenset(task.avoid)
         blocked: Blocked | None = None
-        attempt = Attempt(problem, frozenset(key.split(":")[0] for key in avoided), avoided)
+        attempt = Attempt(problem, frozenset(_moved(key)[0] for key in task.avoid))
         for _ in range(SEARCHES):
             text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
             solution = self._search(attempt, text)
             if solution.steps is None:
                 raise Impossible(_no_room(blocked) if blocked else _dead_end(attempt.problem, problem), blocked)
-            again = [step for step in solution.steps if _key(step) in avoided]
+            again = _failed_before(solution.steps, task.avoid)
             poses = targets.of(solution.steps, current, again=again, late=attempt.reluctant)
             if isinstance(poses, Crowded):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
@@ -328,9 +326,9 @@ def _nowhere(scene: SceneGraph) -> str:
     )
 
 
-def _key(step: Step) -> str:
-    """The key that the step's transfer has."""
-    return f"{step.item}: {step.source} -> {step.destination}"
+def _failed_before(steps: Iterable[Step], avoid: Collection[str]) -> list[Step]:
+    """Steps whose transfer is one of those to avoid."""
+    return [step for step in steps if step.key in avoid]
 
 
 def _moved(key: str) -> tuple[str, str]:

@@ -28,6 +28,11 @@ class Step:
     parent: str = ""
     """What the region belongs to."""
 
+    @property
+    def key(self) -> str:
+        """As :attr:`stages.messages.task.Transfer.key`."""
+        return f"{self.item}: {self.source} -> {self.destination}"
+
 
 @dataclass(frozen=True)
 class Solution:

@@ -133,9 +133,8 @@ class _Way:
         self._waits = {item: other for item, other in self._waits.items() if other != step.item}
 
     def _next(self, step: Step, pending: Sequence[str], *, late: bool) -> Next | Blocked | Crowded:
-        again = f"{step.item}: {step.source} -> {step.destination}" in self._avoided
         rest = [self._home_of(item) for item in pending]
-        return self._targets.next(step, rest, self._scene, again=again, late=late)
+        return self._targets.next(step, rest, self._scene, again=step.key in self._avoided, late=late)
 
     def _home_of(self, item: str) -> Step:
         """The step that takes an item to where it belongs."""
