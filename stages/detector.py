@@ -21,8 +21,8 @@ _FAR = np.float32(100.0)
 """Metres: the robot's own body is put where no object is looked for."""
 _SURE = 0.9
 """Confidence from which on the network knows a label. Little of an object, it takes for another one at less."""
-_OTHERS = 7
-"""Labels by which a candidate is known beside its own, where that is in doubt: as many as were tried."""
+_OTHERS = 8
+"""Labels by which a candidate in doubt is known beside its own: as many as a round of the search tries."""
 _WEIGHTS = Path(__file__).parent / "perception" / "detector.safetensors"
 
 
@@ -179,16 +179,21 @@ class RecordedDetections(Stage):
 
 
 def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int = 0) -> Candidates:
-    """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt."""
-    orders = np.argsort(-confidences, 1, kind="stable")
+    """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt.
+
+    Of these, labels that are seen elsewhere come last: most objects are there once.
+    """
+    best, score = confidences.argmax(1), confidences.max(1, initial=0.0)
+    elsewhere = np.isin(np.arange(len(labels)), best[score >= _SURE])
+    orders = np.lexsort((-confidences, np.broadcast_to(elsewhere, confidences.shape)))
     candidates = tuple(
         Candidate(
             box=box,
-            label=labels[order[0]],
-            confidence=float(row[order[0]]),
-            others=() if row[order[0]] >= _SURE else tuple(labels[k] for k in order[1 : 1 + others]),
+            label=labels[first],
+            confidence=float(row[first]),
+            others=() if row[first] >= _SURE else tuple([labels[k] for k in order if k != first][:others]),
         )
-        for box, row, order in zip(boxes, confidences, orders, strict=True)
+        for box, row, first, order in zip(boxes, confidences, best, orders, strict=True)
     )
     return Candidates(candidates=candidates, labels=labels, confidences=confidences)
 

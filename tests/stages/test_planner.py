@@ -499,3 +499,106 @@ def test_what_keeps_the_hand_from_what_hides_something_is_put_aside_first():
     task = Task(goal_name="goal", goal=goal.graph(), current=current.graph(), aside="salt_shaker")
     (transfer,) = planner().on_task(task, Recorded()).transfers
     assert transfer.object in around and transfer.destination == "table"
+
+
+BESIDE_A_TOWER = (
+    Layout()
+    .put("cereal_box", 0.008, -0.091, yaw=2.65)
+    .put("sauce_bottle", 0.027, 0.162, yaw=2.87)
+    .put("sponge", 0.151, -0.27, yaw=0.94)
+    .put("tea_box", -0.012, -0.286, yaw=0.15)
+    .put("milk_carton", 0.006, 0.005, yaw=0.64, on="tea_box")
+    .put("soup_can", 0.116, -0.17, yaw=0.69)
+)
+"""The carton belongs on the can, the sponge where the carton is: but on the can it keeps the hand from the sponge."""
+TOWERS = (
+    Layout()
+    .put("cereal_box", 0.157, -0.068, yaw=0.19)
+    .put("soup_can", -0.058, -0.04, yaw=-2.22)
+    .put("milk_carton", 0.0, -0.006, yaw=1.2, on="soup_can")
+    .put("sauce_bottle", 0.007, -0.118, yaw=1.11)
+    .put("tea_box", -0.033, -0.307, yaw=-1.02)
+    .put("sponge", -0.003, 0.0, yaw=0.07, on="tea_box")
+)
+FULL_TRAY = (
+    Layout()
+    .put("tray", 0.026, -0.086, yaw=-1.57)
+    .put("salt_shaker", -0.127, -0.065, on="tray")
+    .put("sugar_box", 0.0, -0.065, on="tray")
+    .put("water_bottle", 0.127, -0.065, yaw=1.6, on="tray")
+    .put("sponge", -0.127, 0.065, on="tray")
+    .put("tea_box", 0.0, 0.065, on="tray")
+    .put("sauce_bottle", 0.127, 0.065, on="tray")
+    .put("cereal_box", -0.099, 0.27)
+    .put("soup_can", 0.049, -0.359)
+)
+OTHER_WAY_ROUND = (
+    Layout()
+    .put("tray", 0.039, -0.041, yaw=1.63)
+    .put("water_bottle", -0.127, -0.065, on="tray")
+    .put("sugar_box", 0.0, -0.065, on="tray")
+    .put("salt_shaker", 0.127, -0.065, on="tray")
+    .put("tea_box", -0.127, 0.065, on="tray")
+    .put("sponge", 0.0, 0.065, on="tray")
+    .put("sauce_bottle", 0.127, 0.065, on="tray")
+    .put("cereal_box", 0.012, 0.221, yaw=-1.24)
+    .put("soup_can", -0.027, 0.295)
+)
+
+
+def restored(goal: Layout, start: Layout, *, which: int) -> tuple[list[str], Layout]:
+    """Transfers until nothing is left to do, each to its target number ``which`` (or its last), and the scene then."""
+    keys, then, at = list[str](), (), start
+    while True:
+        task = Task(goal_name="goal", goal=goal.graph(), current=at.graph(), then=then)
+        found = planner().on_task(task, Recorded())
+        if found.status == "satisfied" or len(keys) > 12:
+            return keys, at
+        assert found.status == "solved", (keys, found.reason)
+        first, *rest = found.transfers
+        keys.append(first.key)
+        then = tuple(action for transfer in rest for action in (transfer.pick, transfer.place))
+        at = executed(at, msgspec.structs.replace(found, transfers=(first,)), which=which)
+
+
+def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other():
+    context = Recorded()
+    task = Task(goal_name="goal", goal=OTHER_WAY_ROUND.graph(), current=FULL_TRAY.graph())
+    found = planner().on_task(task, context)
+    assert any("plans one transfer after the other" in line for line in context.lines)
+    assert found.status == "solved", found.reason
+    assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
+    assert penetrations(executed(FULL_TRAY, found)) == []
+    assert len(found.transfers) <= 10
+
+
+@pytest.mark.parametrize("which", [0, 3, 11])
+def test_what_is_left_of_a_plan_is_gone_on_with_wherever_the_hand_puts_things(which: int):
+    keys, after = restored(TOWERS, BESIDE_A_TOWER, which=which)
+    assert reached(TOWERS, after)
+    assert len(keys) <= 5
+
+
+def test_a_plan_that_does_not_lead_to_the_goal_any_more_is_made_anew():
+    found = plan(breakfast(), START)
+    then = tuple(action for transfer in found.transfers[1:] for action in (transfer.pick, transfer.place))
+    for current in (START, Layout({name: T for name, T in START.poses.items() if name != "cup"})):
+        goal = Layout({name: T for name, T in breakfast().poses.items() if name in current.poses})
+        task = Task(goal_name="goal", goal=goal.graph(), current=current.graph(), then=then)
+        again = planner().on_task(task, Recorded())
+        assert again.status == "solved", again.reason
+        assert reached(goal, executed(current, again))
+
+
+def test_places_that_would_be_in_the_way_of_later_ones_are_not_offered():
+    found = plan(TOWERS, BESIDE_A_TOWER)
+    at = BESIDE_A_TOWER
+    for k, transfer in enumerate(found.transfers):
+        for which in range(len(transfer.T_base_targets)):
+            elsewhere = executed(at, msgspec.structs.replace(found, transfers=(transfer,)), which=which)
+            assert penetrations(elsewhere) == []
+            if which and transfer.destination == "table":
+                rest = msgspec.structs.replace(found, transfers=found.transfers[k + 1 :])
+                carried = {other.destination for other in found.transfers[k + 1 :]}
+                assert transfer.object in carried or penetrations(executed(elsewhere, rest)) == []
+        at = executed(at, msgspec.structs.replace(found, transfers=(transfer,)))
