@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.scene.naming import Named, names_kept, unique_names
+from stages.scene.naming import Named, exchanges, names_kept, unique_names
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,15 @@ def test_the_one_that_is_still_seen_keeps_its_name() -> None:
 
 def test_places_of_other_labels_mean_nothing() -> None:
     assert names_kept(["bowl"], at(0.0), known(cup=0.0)) == [None]
+
+
+def test_equal_objects_are_exchanged_in_every_way() -> None:
+    labels, names = ["cup", "bowl", "cup"], ["cup", "bowl", "cup_2"]
+    assert list(exchanges(labels, names, {})) == [["cup", "bowl", "cup_2"], ["cup_2", "bowl", "cup"]]
+
+
+def test_what_is_exchanged_takes_the_names_that_are_wanted_first() -> None:
+    wanted = {"cup": "cup", "cup_3": "cup", "bowl_2": "bowl"}
+    assert list(exchanges(["cup"], ["cup_2"], wanted)) == [["cup"], ["cup_3"]]
+    three = list(exchanges(["cup"] * 3, ["cup_2", "cup", "cup_5"], wanted))
+    assert len(three) == 6 and {frozenset(names) for names in three} == {frozenset({"cup", "cup_3", "cup_2"})}

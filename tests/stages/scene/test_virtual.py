@@ -1,5 +1,6 @@
 """Proximity: which pairs get a region, and where the region is when things have moved."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +9,7 @@ from hypothesis import strategies as st
 from stages.messages import SceneGraph
 from stages.scene.stance import yawed
 from stages.scene.virtual import rerooted, satisfied
-from tests.stages.layouts import Layout, asserted, breakfast, catalogue
+from tests.stages.layouts import Layout, asserted, breakfast, builder, catalogue
 
 
 def violated(goal: SceneGraph, current: SceneGraph) -> set[str]:
@@ -53,6 +54,25 @@ def test_a_chain_can_be_told_from_its_other_end():
     assert pairs(told) == {(child, parent) for parent, child in pairs(goal)}
     assert violated(told, goal) == set()
     assert len(told.assertions) == len(goal.assertions)
+
+
+def doubted(layout: Layout, *names: str) -> set[tuple[str, str]]:
+    """Parents and children where the poses of some objects are in doubt."""
+    estimate = layout.estimate()
+    objects = (
+        msgspec.structs.replace(item, probability=0.7 if item.name in names else 0.99) for item in estimate.objects
+    )
+    return pairs(builder().on_scene_estimate(msgspec.structs.replace(estimate, objects=tuple(objects))))
+
+
+def test_what_is_in_doubt_is_beside_others_and_nothing_beside_it():
+    assert doubted(beside()) == doubted(beside(), "mug") == {("cereal_box", "mug")}
+    assert doubted(beside(), "cereal_box") == {("mug", "cereal_box")}
+    # A mug between two boxes that are also beside each other; and one that alone joins them.
+    corner = Layout().put("cereal_box", 0.0, 0.0).put("sugar_box", 0.0, 0.11).put("mug", 0.12, 0.055)
+    assert ("mug", "sugar_box") not in doubted(corner, "mug") and len(doubted(corner, "mug")) == 2
+    row = Layout().put("cereal_box", 0.0, 0.0).put("mug", 0.0, 0.12).put("sugar_box", 0.0, 0.24)
+    assert doubted(row, "mug") == {("cereal_box", "mug"), ("mug", "sugar_box")}
 
 
 def test_what_cannot_be_moved_is_the_root():

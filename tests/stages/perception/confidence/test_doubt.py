@@ -77,6 +77,24 @@ def test_colour_settles_what_depth_cannot_see() -> None:
     assert before.shares and not after.shares
 
 
+def test_of_two_equal_objects_in_one_place_one_is_contradicted() -> None:
+    seen = render({"sponge": upright("sponge", 0.0, 0.0, 0.0), "cup": upright("cup", 0.15, 0.0, 0.0)})
+    T = seen.poses["sponge"]
+    beside = T @ pose(np.eye(3), np.array([0.015, 0.0, 0.0]))
+    judge = Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE)
+
+    def contradicted(*items: Judged) -> list[bool]:
+        return [found.contradicted for found in judge.assess(seen.scene, items, np.zeros(1), 0).objects]
+
+    cup = Judged("cup", seen.poses["cup"], 0.9)
+    twice = [Judged("sponge", where, 0.9, penetration=0.03) for where in (beside, T)]
+    assert contradicted(*twice, cup) == [True, False, False]
+    touching = [replace(item, penetration=0.01) for item in twice]
+    assert contradicted(*touching, cup) == [False, False, False]
+    other_kind = [twice[1], replace(cup, penetration=0.03)]
+    assert contradicted(*other_kind) == [False, False]
+
+
 def test_an_object_that_floats_before_the_readings_is_contradicted() -> None:
     seen = render({"tea_box": BOX})
     lifted = {"tea_box": pose(np.eye(3), np.array([0.0, 0.0, -0.1])) @ seen.poses["tea_box"]}

@@ -110,3 +110,20 @@ def test_regions_of_what_is_seen_stay() -> None:
     scene = completed(seen, pair, pair)
     assert {item.name for item in scene.virtual_objects} == {item.name for item in graph(seen).virtual_objects} != set()
     assert {text for text in asserted(graph(seen)) if "_near_" in text} <= asserted(scene)
+
+
+def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
+    """Two sponges, of which the hand has put the first where the look now calls it another one."""
+    here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
+    seen = {"sponge_3": there, "sponge_2": here, "milk_carton": CARTON}
+    before = {"sponge": there, "sponge_2": here, "milk_carton": CARTON}
+    scene = completed(seen, before, {"milk_carton": CARTON})
+    assert names(scene) == ["sponge", "sponge_2", "milk_carton"]
+    assert "on(sponge, table)" in asserted(scene)
+
+
+def test_one_more_than_are_known_keeps_out_of_their_names() -> None:
+    here, there, new = (upright("sponge", x, 0.1, 0.0) for x in (0.2, -0.2, 0.0))
+    seen = {"sponge_2": new, "sponge": there, "sponge_3": here}
+    scene = completed(seen, {"sponge": here, "sponge_2": there}, {})
+    assert names(scene) == ["sponge_3", "sponge_2", "sponge"]
