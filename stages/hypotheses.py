@@ -94,7 +94,7 @@ class Hypotheses(Stage):
         found = [_Found(s.candidate, s.start, s.glimpse, s.share) for s in sightings if s.candidate is not None
                  and s.start is not None and s.glimpse is not None]  # fmt: skip
         if found:
-            yield from self._cheapest(_distinct(found, ctx), number, ctx)
+            yield from self._cheapest(found, number, ctx)
         else:
             yield from self._most_confident([s.candidate for s in sightings if s.candidate is not None], number, ctx)
 
@@ -135,7 +135,8 @@ class Hypotheses(Stage):
         for index, combination in enumerate(combinations):
             yield Hypothesis(index=index, count=len(combinations), candidates=combination, left_out=left_out)
 
-    def _cheapest(self, found: list[_Found], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
+    def _cheapest(self, seen: list[_Found], number: int | None, ctx: Context) -> Iterator[Hypothesis]:
+        found = _distinct(seen, ctx)
         if number is None:
             found = _not_refuted(found, ctx)
         charges = [each.charge if number is None else 0.0 for each in found]
@@ -152,7 +153,8 @@ class Hypotheses(Stage):
         )
         offers = (
             *(Offer(candidate=each.candidate, share=each.share) for each in found),
-            *(offer for each in found for offer in _instead(each)),
+            # What shows an object once more may show another one, too.
+            *(offer for each in seen for offer in _instead(each)),
         )
         search = None if number is not None else Search(offers=offers)
         for index, chosen in enumerate(combinations):

@@ -267,6 +267,25 @@ def test_what_covers_the_readings_but_fits_worse_than_the_others_is_tried_by_ano
     assert {item.label for item in estimate.objects} == set(partly)
 
 
+def test_what_shows_an_object_once_more_may_show_what_carries_it(filter_stage: ParticleFilter) -> None:
+    """The box of a can below a carton, of which the detector says that it shows the carton again."""
+    can = upright("soup_can", 0.0, 0.0, 0.0)
+    carton = upright("cereal_box", 0.005, 0.01, 0.8)
+    carton[2, 3] += 0.1
+    tower = render({"soup_can": can, "cereal_box": carton})
+    (x0, _, _, y1), (_, top, x1, bottom) = tower.boxes["soup_can"], tower.boxes["cereal_box"]
+    both_in_part = np.array([x0, top + 0.2 * (bottom - top), x1, y1])
+    found = candidates(("cereal_box", tower.boxes["cereal_box"], 0.95), ("cereal_box", both_in_part, 0.1))
+    config = Hypotheses.Config(n_objects="auto")
+    for others, labels in (((), {"cereal_box"}), (("tuna_can", "soup_can"), {"cereal_box", "soup_can"})):
+        doubted = msgspec.structs.replace(found.candidates[1], others=others)
+        doubled = msgspec.structs.replace(found, candidates=(found.candidates[0], doubted))
+        (observation, *hypotheses), ctx = enumerate_(config, frame(tower), doubled, filter_stage)
+        assert any("show an object once more" in line for line in ctx.lines)
+        estimate = ranked(config, hypotheses, filter_stage, observation)
+        assert {item.label for item in estimate.objects} == labels
+
+
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))

@@ -21,6 +21,8 @@ DATA = Path(__file__).parents[5] / "shared" / "data"
 CATALOGUE = Catalogue.load(BUILT_IN)
 NAMES = list(CATALOGUE.objects)
 OPENING = 0.10
+FINGER = 0.07
+"""Metres from the palm of a Fetch to its fingertips."""
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data sets in ../shared/data are absent")
 
 
@@ -47,6 +49,13 @@ def test_grasps_are_rigid_and_come_from_ten_centimetres_back(name: str) -> None:
     assert len({grasp.name for grasp in CATALOGUE[name].grasps if grasp.kind == "top"}) == sum(
         grasp.kind == "top" for grasp in CATALOGUE[name].grasps
     )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_grasp_is_deeper_than_fingers_are_long(name: str) -> None:
+    for grasp in CATALOGUE[name].grasps:
+        along = (CATALOGUE[name].mesh.vertices - grasp.T_object_grasp[:3, 3]) @ grasp.T_object_grasp[:3, 0]
+        assert -along.min() < FINGER, grasp.name
 
 
 @pytest.mark.parametrize("name", NAMES)
