@@ -29,6 +29,8 @@ _DRAWS = 60
 """Places of the hand that are tried for each posture."""
 _CLEARANCE = 0.002
 """Metres that motions keep from everything; postures keep more, so that the arm that is a little off can leave them."""
+_AROUND = 0.03
+"""Metres by which the table may reach further than it is declared, to all sides and down."""
 _BUMP = 7.0
 """Newtons at the hand that are a touch."""
 
@@ -38,7 +40,14 @@ Homecoming = Generator[RobotCommand, RobotState, Outcome]
 
 def world_of(robot: Robot, request: PostureRequest, *, clearance: float = AMPLE) -> CollisionWorld:
     """The robot, the table at its height, and what is occupied."""
-    table = replace(robot.table, height=request.table_height)
+    declared = robot.table
+    width, depth = declared.size
+    table = replace(
+        declared,
+        height=request.table_height,
+        size=(width + 2 * _AROUND, depth + 2 * _AROUND),
+        thickness=declared.thickness + 2 * _AROUND,
+    )
     boxes = tuple(
         Primitive("box", tuple((high - low).tolist()), pose(np.eye(3), (low + high) / 2))
         for low, high in zip(request.occupied[:, :3], request.occupied[:, 3:], strict=True)
