@@ -34,8 +34,8 @@ def virtual_objects(
     cycles. In each tree an object that cannot be moved, then the one with the largest footprint, is the root, and
     every other object belongs into a region of its neighbour towards the root. So each object has one parent.
 
-    A region turns with its parent. Objects whose pose is ``doubtful`` are therefore parents only where nothing else
-    joins their neighbours.
+    A region turns with its parent. An object whose pose is ``doubtful`` is therefore the parent of none, unless it is
+    the root: what it alone joins to the others belongs into a region of its own parent.
     """
     made: list[VirtualObject] = []
     for supporter in dict.fromkeys(support.parent for support in found.values()):
@@ -55,10 +55,11 @@ def _region(parent: Standing, child: Standing, radius: float) -> VirtualObject:
 
 
 def _tree(siblings: Sequence[Standing], gap: float, doubtful: Collection[str]) -> list[tuple[Standing, Standing]]:
-    """(parent, child) pairs of the minimum spanning forest, parents first."""
+    """(parent, child) pairs of the minimum spanning forest, parents first, a sure one for each child."""
     edges = _spanning(siblings, gap, doubtful)
     pairs: list[tuple[Standing, Standing]] = []
     reached: set[str] = set()
+    sure: dict[str, Standing] = {}
     for root in sorted(siblings, key=lambda item: _root_first(item, item.name in doubtful)):
         pending = [] if root.name in reached else [root]
         reached.add(root.name)
@@ -66,7 +67,8 @@ def _tree(siblings: Sequence[Standing], gap: float, doubtful: Collection[str]) -
             parent = pending.pop(0)
             children = [c for c in siblings if frozenset((parent.name, c.name)) in edges and c.name not in reached]
             reached.update(child.name for child in children)
-            pairs += [(parent, child) for child in children]
+            pairs += [(sure.get(parent.name, parent), child) for child in children]
+            sure |= {child.name: sure.get(parent.name, parent) for child in children if child.name in doubtful}
             pending += children
     return pairs
 

@@ -72,7 +72,10 @@ def test_what_is_in_doubt_is_beside_others_and_nothing_beside_it():
     corner = Layout().put("cereal_box", 0.0, 0.0).put("sugar_box", 0.0, 0.11).put("mug", 0.12, 0.055)
     assert ("mug", "sugar_box") not in doubted(corner, "mug") and len(doubted(corner, "mug")) == 2
     row = Layout().put("cereal_box", 0.0, 0.0).put("mug", 0.0, 0.12).put("sugar_box", 0.0, 0.24)
-    assert doubted(row, "mug") == {("cereal_box", "mug"), ("mug", "sugar_box")}
+    assert doubted(row) == {("cereal_box", "mug"), ("mug", "sugar_box")}
+    assert doubted(row, "mug") == {("cereal_box", "mug"), ("cereal_box", "sugar_box")}
+    assert doubted(row, "mug", "cereal_box") == {("sugar_box", "mug"), ("sugar_box", "cereal_box")}
+    assert doubted(row, "mug", "cereal_box", "sugar_box") == doubted(row, "mug")
 
 
 def test_what_cannot_be_moved_is_the_root():
