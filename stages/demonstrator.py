@@ -175,7 +175,7 @@ class Demonstrator(Stage):
         """Failures of one transfer before plans avoid it."""
         max_replans: int = 8
         """Plans that replace, rather than continue, the one before."""
-        max_transfers: int = 16
+        max_transfers: int = 24
 
         def __post_init__(self) -> None:
             """Refuses limits that are not counts and names that are no file names."""

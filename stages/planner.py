@@ -21,7 +21,7 @@ from stages.planning.pddl import DOMAIN, problem_pddl
 from stages.planning.placements import Placements, Scene
 from stages.planning.problem import TABLE, Problem, cycle, wanted
 from stages.planning.search import Solution, Step
-from stages.planning.stepwise import stepwise
+from stages.planning.stepwise import shortened, stepwise
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
@@ -67,7 +67,8 @@ class Attempt:
             placed = names & earlier
             if placed - self.reluctant:
                 return replace(self, reluctant=self.reluctant | placed)
-            added = {(name, step.item, step.destination) for name in names & problem.graspable - earlier}
+            where = step.region or step.destination
+            added = {(name, step.item, where) for name in names & problem.graspable - earlier}
             meanwhile = placed & obstacles - {step.destination, step.parent}
             added |= {(step.item, name, problem.finally_at(name)) for name in meanwhile}
             if added - problem.obstructions:
@@ -120,10 +121,7 @@ class Planner(Stage):
         return self._plan(task, task.goal, ctx)
 
     def _plan(self, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
-        """A plan for the task's goal, which may tell the regions that were ``taught`` the other way round.
-
-        Where an object is in the way of the hand that puts another one beside it, the other one comes first.
-        """
+        """A plan for the task's goal, which may tell the regions that were ``taught`` the other way round."""
         held, violated = satisfied(task.goal, task.current, self._catalogue)
         problem = self._problem(task, held)
         text = problem_pddl(task.goal_name, problem, task.current, task.goal)
@@ -141,6 +139,12 @@ class Planner(Stage):
             refused, blocked = _answer("refused", text, reason=str(reason)), reason.blocked
         if task.goal is not taught or blocked is None:
             return refused
+        return self._another_way(task, problem, blocked, refused, ctx)
+
+    def _another_way(self, task: Task, problem: Problem, blocked: Blocked, refused: Plan, ctx: Context) -> Plan:
+        """What the search does not find. Where an object is in the way of the hand that puts another one beside it, the
+        other one comes first; else one transfer is planned after the other."""
+        taught = task.goal
         beside = problem.graspable.issuperset(problem.beside(blocked.step.item))
         if blocked.step.parent in blocked.obstacles and beside:
             ctx.log(f"{refused.reason}; places {blocked.step.item} first")
@@ -148,9 +152,11 @@ class Planner(Stage):
             if plan.status == "solved":
                 return plan
         ctx.log(f"{refused.reason}; plans one transfer after the other")
-        targets = self._targets(problem, task, taught, ctx)
-        steps = stepwise(problem, targets, self._scene(task), ctx.rng, avoided=task.avoid)
-        return refused if steps is None else _solved(steps, text, problem)
+        targets, scene = self._targets(problem, task, taught, ctx), self._scene(task)
+        steps = stepwise(problem, targets, scene, ctx.rng, avoided=task.avoid)
+        if steps is None:
+            return refused
+        return _solved(shortened(steps, problem, targets, scene), refused.problem_pddl, problem)
 
     def _put_aside(self, task: Task, ctx: Context) -> Plan:
         """One transfer, to a place on the table where the object hides nothing of what it hides now; of what keeps the
@@ -258,6 +264,8 @@ class Planner(Stage):
                 continue
             if not isinstance(poses, Blocked):
                 steps = zip(solution.steps, poses, strict=True)
+                if attempt.problem != problem:  # What was thought to be in the way need not be.
+                    steps = shortened(steps, problem, targets, current)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, solution.steps)
             if following is None:

@@ -3,14 +3,14 @@
 The search of :mod:`stages.planning.search` finds the fewest transfers, and learns of room only from steps that had
 none: what it learns it never forgets, and in dense scenes that may rule out every order. Here an object that can go
 where it belongs goes there; where none can, what is in the way of one is put aside, and waits until that one has
-moved. What ends nowhere begins again in another order. Such plans make detours, so each step is left out that the rest
-can do without; they may still be longer than they need be.
+moved. What ends nowhere begins again in another order. Such plans make detours (:func:`shortened`), and may be longer
+than they need be even without them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,15 +38,15 @@ def stepwise(
     for _ in range(_STARTS):
         way = _Way(Moves(problem, order), problem, targets, scene, avoided)
         if way.leads_home():
-            return _shortened(way.steps, problem, targets, scene)
+            return way.steps
         rng.shuffle(order)
     return None
 
 
-def _shortened(
-    steps: Sequence[tuple[Step, Floats]], problem: Problem, targets: Targets, scene: Scene
+def shortened(
+    steps: Iterable[tuple[Step, Floats]], problem: Problem, targets: Targets, scene: Scene
 ) -> list[tuple[Step, Floats]]:
-    """The same without steps that the others can do without."""
+    """Steps with their T_base_targets, without those that the others can do without."""
     best, k = list(steps), 0
     while k < len(best):
         fewer = _without([step for step, _ in best], k)
@@ -143,11 +143,12 @@ class _Way:
         return Step(item, self._scene.supports[item], self._problem.goal.get(item, TABLE), *beside)
 
     def _in_the_way(self, blocked: Blocked) -> Sequence[str]:
-        """What a step is blocked by. A region in which there is no room goes with what it is beside; where nothing is
-        known, it may be what stands beside the object."""
+        """What a step is blocked by and can be moved. Where there is none, a region without room goes with what it is
+        beside; where nothing is known, it may be what stands beside the object."""
         step = blocked.step
+        movable = [name for name in blocked.obstacles if name in self._problem.graspable]
         parent = [step.parent] if step.region and not blocked.why else []
-        return blocked.obstacles or parent or neighbours(step.item, self._scene)
+        return movable or parent or neighbours(step.item, self._scene)
 
     def _uppermost(self, name: str) -> str:
         """What has to be moved first to move an object: it, or what rests on it."""

@@ -28,8 +28,9 @@ from stages.scene.catalogue import Catalogue
 
 _PLANE = 0.02
 """Metres from the plane within which a reading that is no foreground is the plane's."""
-_IN_ONE_PLACE = 0.015
-"""Metres that two equal objects reach into each other where they are one that was found twice."""
+_APART = 0.006, 0.015
+"""Metres that two equal objects reach into each other where they are one that was found twice: nearer to each other than
+half of their least dimension, and at any distance. Bowls that stand in each other do not."""
 _OFF = 0.012
 """Metres along the ray, at one metre, beyond which a reading does not lie on a surface; grows with the square of depth
 as the noise of triangulation does."""
@@ -126,7 +127,7 @@ class Judge:
         layers = self.layers(scene, objects)
         found = self.evidence(scene, objects, layers, float(probabilities[winner]))
         doubts = tuple(_doubt(*each, self._calibration) for each in found)
-        return SceneDoubt(probabilities, _once(objects, doubts), unknown_regions(scene, layers))
+        return SceneDoubt(probabilities, self._once(objects, doubts), unknown_regions(scene, layers))
 
     def evidence(
         self, scene: ObservedScene, objects: Sequence[Judged], layers: Sequence[Float32s], hypothesis: float
@@ -146,6 +147,25 @@ class Judge:
         """The inverse depth of each object alone, H x W."""
         return [inverse_depth(self._model(o.label).shape.soup, o.T_camera_object, scene.view) for o in objects]
 
+    def _once(self, objects: Sequence[Judged], doubts: Sequence[PoseDoubt]) -> tuple[PoseDoubt, ...]:
+        """Of two equal objects that are each other's deepest neighbour and one and the same, the less probable one
+        cannot be there."""
+
+        def doubled(i: int) -> bool:
+            return any(
+                doubts[k].probability > doubts[i].probability and self._same(objects[i], other)
+                for k, other in enumerate(objects)
+            )
+
+        return tuple(replace(doubt, contradicted=doubt.contradicted or doubled(i)) for i, doubt in enumerate(doubts))
+
+    def _same(self, one: Judged, other: Judged) -> bool:
+        if one.label != other.label or one.penetration != other.penetration:
+            return False
+        distance = np.linalg.norm(one.T_camera_object[:3, 3] - other.T_camera_object[:3, 3])
+        near = distance < 0.5 * self._catalogue[one.label].dimensions.min()
+        return one.penetration > (_APART[0] if near else _APART[1])
+
     def _model(self, label: str) -> Model:
         if label not in self._models:
             self._models[label] = Model(self._catalogue[label], self._dof)
@@ -159,21 +179,6 @@ def _doubt(evidence: Evidence, others: Others, constants: Calibration) -> PoseDo
     shares *= min(1.0, (1.0 - probability) / max(float(shares.sum()), 1e-9))
     contradicted = is_contradicted(evidence.looked_through)
     return PoseDoubt(evidence, probability, others.poses, tuple(shares.tolist()), contradicted)
-
-
-def _once(objects: Sequence[Judged], doubts: Sequence[PoseDoubt]) -> tuple[PoseDoubt, ...]:
-    """Of two equal objects that are each other's deepest neighbour, and deep, the less probable one cannot be there."""
-
-    def doubled(i: int) -> bool:
-        return objects[i].penetration > _IN_ONE_PLACE and any(
-            other.label == objects[i].label
-            and other.penetration == objects[i].penetration
-            and doubts[k].probability > doubts[i].probability
-            for k, other in enumerate(objects)
-            if k != i
-        )
-
-    return tuple(replace(doubt, contradicted=doubt.contradicted or doubled(i)) for i, doubt in enumerate(doubts))
 
 
 def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> NDArray[np.bool_]:

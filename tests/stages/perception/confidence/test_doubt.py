@@ -80,18 +80,21 @@ def test_colour_settles_what_depth_cannot_see() -> None:
 def test_of_two_equal_objects_in_one_place_one_is_contradicted() -> None:
     seen = render({"sponge": upright("sponge", 0.0, 0.0, 0.0), "cup": upright("cup", 0.15, 0.0, 0.0)})
     T = seen.poses["sponge"]
-    beside = T @ pose(np.eye(3), np.array([0.015, 0.0, 0.0]))
     judge = Judge(CATALOGUE, dof=6, calibration=PLAUSIBLE)
 
     def contradicted(*items: Judged) -> list[bool]:
         return [found.contradicted for found in judge.assess(seen.scene, items, np.zeros(1), 0).objects]
 
     cup = Judged("cup", seen.poses["cup"], 0.9)
-    twice = [Judged("sponge", where, 0.9, penetration=0.03) for where in (beside, T)]
-    assert contradicted(*twice, cup) == [True, False, False]
-    touching = [replace(item, penetration=0.01) for item in twice]
-    assert contradicted(*touching, cup) == [False, False, False]
-    other_kind = [twice[1], replace(cup, penetration=0.03)]
+
+    def twice(millimetres: float, deep: float) -> list[Judged]:
+        """The sponge, and one that lies a little beside it, further down."""
+        beside = T @ pose(np.eye(3), np.array([0.0, 0.0, -0.001 * millimetres]))
+        return [Judged("sponge", where, 0.9, penetration=0.001 * deep) for where in (beside, T)]
+
+    for millimetres, deep, doubled in ((10, 9, True), (10, 4, False), (30, 9, False), (30, 20, True)):
+        assert contradicted(*twice(millimetres, deep), cup) == [doubled, False, False]
+    other_kind = [twice(10, 20)[1], replace(cup, penetration=0.02)]
     assert contradicted(*other_kind) == [False, False]
 
 
