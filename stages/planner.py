@@ -56,12 +56,13 @@ class Attempt:
 
         What stands in the way is moved first, or placed later if the plan itself put it there. A region without
         room may have it elsewhere, and what carries the object may stand where the hand does not get above it: then
-        what the object goes beside is moved first, or what that is beside, and so on; or else what carries it.
+        what the object goes beside is moved first, or what that is beside, and so on; or else what carries it. What
+        the object goes beside and is in the hand's way would be so wherever it stood.
         """
         step, problem = blocked.step, self.problem
         earlier = {before.item for before in steps[: steps.index(step)]}
-        obstacles = problem.graspable & set(blocked.obstacles)
-        beside = [*problem.beside(step.item)] if step.region else []
+        obstacles = problem.graspable & set(blocked.obstacles) - {step.parent}
+        beside = [name for name in problem.beside(step.item) if name not in blocked.obstacles] if step.region else []
         below = [step.destination, *problem.beside(step.destination)] if step.destination != TABLE else []
         for names in (obstacles, *({name} for name in (*beside, *below))):
             placed = names & earlier

@@ -208,23 +208,31 @@ class Targets:
             onward = self._chosen(rest, scene.after(step.item, places[number], step.destination), again, late)
             if isinstance(onward, list):
                 offered = places[number : max(self._workspace.targets, number + FEWEST)]
-                return [self._harmless(offered, rest, scene, [one[0] for one in onward]), *onward]
+                return [self._harmless(offered, step, rest, scene, [one[0] for one in onward]), *onward]
             failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
                 break
         return _trouble(step, options, failed)
 
     def _harmless(
-        self, places: Sequence[Standing], rest: Sequence[Step], scene: Scene, later: Sequence[Standing]
+        self, places: Sequence[Standing], step: Step, rest: Sequence[Step], scene: Scene, later: Sequence[Standing]
     ) -> list[Standing]:
-        """The first place, and those others that are in the way of nothing that comes while the object is there."""
+        """The first place, and those others from which the plan goes on as well.
+
+        They are in the way of nothing that comes while the object is there, and leave room for what goes on, in or
+        beside it.
+        """
         first, *others = places
-        meanwhile = list(takewhile(lambda item: item.name != first.name, later))
+        meanwhile = len(list(takewhile(lambda other: other.item != step.item, rest)))
         crowds = self._crowds(first, rest, scene)
+        children = [other for other in rest[:meanwhile] if step.item in (other.parent, other.destination)]
 
         def leads_on(place: Standing) -> bool:
-            blocks = any(_is_near(place, item, self._workspace.clearance) for item in meanwhile)
-            return not blocks and (crowds or not self._crowds(place, rest, scene))
+            if any(_is_near(place, item, self._workspace.clearance) for item in later[:meanwhile]):
+                return False
+            after = scene.after(step.item, place, step.destination)
+            room = all(self._goal_poses(child, after)[0] for child in children)
+            return room and (crowds or not self._crowds(place, rest, scene))
 
         return [first, *filter(leads_on, others)]
 

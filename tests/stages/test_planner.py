@@ -245,11 +245,9 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
 
 
 def test_of_two_that_stand_close_the_one_that_leaves_the_hand_room_is_placed_last():
-    """The goal has the tea box beside the bottle; with the bottle there, no finger fits between them."""
-    goal = (
-        Layout().put("bowl", 0.046, -0.314).put("water_bottle", 0.145, -0.216).put("tea_box", 0.114, -0.147, yaw=1.62)
-    )
-    start = Layout().put("bowl", 0.05, 0.295).put("water_bottle", -0.02, 0.0).put("tea_box", 0.12, -0.259, yaw=-1.06)
+    """The goal has the sponge beside the bottle; with the bottle there, no finger fits between them."""
+    goal = Layout().put("bowl", 0.046, -0.314).put("water_bottle", 0.145, -0.216).put("sponge", 0.114, -0.147, yaw=1.62)
+    start = Layout().put("bowl", 0.05, 0.295).put("water_bottle", -0.02, 0.0).put("sponge", 0.12, -0.259, yaw=-1.06)
     found = plan(goal, start)
     assert [transfer.object for transfer in found.transfers] == ["water_bottle", "bowl"]
     assert reached(goal, executed(start, found))

@@ -29,8 +29,8 @@ from stages.scene.catalogue import Catalogue
 _PLANE = 0.02
 """Metres from the plane within which a reading that is no foreground is the plane's."""
 _APART = 0.006, 0.015
-"""Metres that two equal objects reach into each other where they are one that was found twice: nearer to each other than
-half of their least dimension, and at any distance. Bowls that stand in each other do not."""
+"""Metres that two equal objects reach into each other where they are one that was found twice: nearer to each other
+than half of their least dimension, and at any distance. Bowls that stand in each other do not."""
 _OFF = 0.012
 """Metres along the ray, at one metre, beyond which a reading does not lie on a surface; grows with the square of depth
 as the noise of triangulation does."""
