@@ -148,12 +148,12 @@ class Judge:
         return [inverse_depth(self._model(o.label).shape.soup, o.T_camera_object, scene.view) for o in objects]
 
     def _once(self, objects: Sequence[Judged], doubts: Sequence[PoseDoubt]) -> tuple[PoseDoubt, ...]:
-        """Of two equal objects that are each other's deepest neighbour and one and the same, the less probable one
+        """Of two equal objects that are each other's deepest neighbour and one and the same, the one that shows less
         cannot be there."""
 
         def doubled(i: int) -> bool:
             return any(
-                doubts[k].probability > doubts[i].probability and self._same(objects[i], other)
+                doubts[k].evidence.shown > doubts[i].evidence.shown and self._same(objects[i], other)
                 for k, other in enumerate(objects)
             )
 
