@@ -341,9 +341,7 @@ class TransferRoutine:
         retreat = at.planner.retreat(place.hand, q)
         retreat = place.lower[::-1] if retreat is None else retreat
         yield from self._do("retreat", retreat, speed=_SLOW, guard=Guard(force=_RUB))
-        yield from self._do("open the hand", width=self._robot.gripper.open_width)
-        world.set_width(self._robot.gripper.open_width)
-        failure = yield from self._home(world, retreat[-1])
+        failure = yield from self._open_and_home(world, retreat[-1], wanted)
         if state.gripper_width < (held + wanted) / 2:
             self._tally.T_base_object = None
             return "release", f"the hand opened to {1e3 * state.gripper_width:.0f} mm of {1e3 * wanted:.0f}"
@@ -371,6 +369,20 @@ class TransferRoutine:
                 return q, True
         return q, False
 
+    def _open_and_home(self, world: CollisionWorld, q: Floats, width: float) -> Steps:
+        """Opens the hand, from ``width`` metres, where there is room for that, else at home."""
+        widest = self._robot.gripper.open_width
+        world.set_width(widest)
+        room = world.is_free(q)
+        if room:
+            yield from self._do("open the hand", width=widest)
+        else:
+            world.set_width(width)
+        failure = yield from self._home(world, q)
+        if not room and not failure[0]:
+            yield from self._do("open the hand", width=widest)
+        return failure
+
     def _home(self, world: CollisionWorld, q: Floats, *, rise: float = 0.0) -> Steps:
         """Collision-free motion home; after a touch, or where something is too close, from straight above.
 
@@ -379,7 +391,8 @@ class TransferRoutine:
         began = time.perf_counter()
         path = self._home_from_above(world, q, rise) if rise else None
         path = free_motion(world, q, self._robot.home, self._rng) if path is None else path
-        path = self._home_from_above(world, q, LIFT) if path is None else path
+        for height in (LIFT, LIFT / 2, LIFT / 4):
+            path = self._home_from_above(world, q, height) if path is None else path
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
