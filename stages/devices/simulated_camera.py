@@ -23,9 +23,9 @@ from stages.scene.scoring import label_of
 
 ROBOT_MARGIN = 0.03
 """Metres by which the robot's surface may lie behind a reading and still be what was read."""
-_MASK_GROWTH = 10
-"""Pixels by which the robot may lie beside where encoders and the declared camera have it: 5 mm, half a degree and 4
-pixels between depth and colour."""
+_MASK_GROWTH = 1 / 64
+"""Share of the image's width by which the robot may lie beside where encoders and the declared camera have it: 5 mm,
+half a degree and, at 640 pixels across, 4 pixels between depth and colour."""
 _ROOM_LIGHT = Lighting(
     lights=(
         Light("directional", (0.35, 0.25, -1.0), 2.0),
@@ -117,7 +117,8 @@ def _may_be_seen(item: Item, camera: Camera, size: tuple[int, int]) -> bool:
 def robot_pixels(body: Depth, depth: Depth) -> Mask:
     """Where the rendered robot ``body`` (H x W, 0 = not there) explains the observed ``depth`` (H x W)."""
     covered = (body > 0) & ((depth == 0) | (body < depth + ROBOT_MARGIN))
-    kernel = np.ones((2 * _MASK_GROWTH + 1, 2 * _MASK_GROWTH + 1), np.uint8)
+    growth = max(1, round(_MASK_GROWTH * depth.shape[1]))
+    kernel = np.ones((2 * growth + 1, 2 * growth + 1), np.uint8)
     return cv2.dilate(covered.astype(np.uint8), kernel).astype(bool)
 
 
