@@ -157,7 +157,8 @@ class Planner(Stage):
         steps = stepwise(problem, targets, scene, ctx.rng, avoided=task.avoid)
         if steps is None:
             return refused
-        return _solved(shortened(steps, problem, targets, scene), refused.problem_pddl, problem)
+        steps = shortened(steps, problem, targets, scene, avoided=task.avoid)
+        return _solved(steps, refused.problem_pddl, problem)
 
     def _put_aside(self, task: Task, ctx: Context) -> Plan:
         """One transfer, to a place on the table where the object hides nothing of what it hides now; of what keeps the
@@ -266,7 +267,7 @@ class Planner(Stage):
             if not isinstance(poses, Blocked):
                 steps = zip(solution.steps, poses, strict=True)
                 if attempt.problem != problem:  # What was thought to be in the way need not be.
-                    steps = shortened(steps, problem, targets, current)
+                    steps = shortened(steps, problem, targets, current, avoided=task.avoid)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, solution.steps)
             if following is None:

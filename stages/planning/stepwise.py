@@ -44,13 +44,19 @@ def stepwise(
 
 
 def shortened(
-    steps: Iterable[tuple[Step, Floats]], problem: Problem, targets: Targets, scene: Scene
+    steps: Iterable[tuple[Step, Floats]],
+    problem: Problem,
+    targets: Targets,
+    scene: Scene,
+    *,
+    avoided: Collection[str] = (),
 ) -> list[tuple[Step, Floats]]:
-    """Steps with their T_base_targets, without those that the others can do without."""
+    """Steps with their T_base_targets, without those that the others can do without; ``avoided`` as above."""
     best, k = list(steps), 0
     while k < len(best):
         fewer = _without([step for step, _ in best], k)
-        poses = targets.of(fewer, scene, late=problem.items) if leads_home(fewer, problem) else None
+        again = [step for step in fewer if step.key in avoided]
+        poses = targets.of(fewer, scene, again=again, late=problem.items) if leads_home(fewer, problem) else None
         if isinstance(poses, list):
             best = list(zip(fewer, poses, strict=True))
         else:
