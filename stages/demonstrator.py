@@ -54,7 +54,7 @@ from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
-from stages.scene.relations import Tolerances, hanging
+from stages.scene.relations import Tolerances, gaps
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
@@ -509,8 +509,8 @@ class Demonstrator(Stage):
             if len(scene.objects) < wanted:
                 return f"{len(scene.objects)} of {wanted} objects seen"
             standing = standing_of(scene.objects, self._stances, scene.T_base_table)
-            names = hanging(standing, scene.assertions, Tolerances())
-            return f"not seen: what carries {', '.join(names)}" if names else ""
+            hanging = gaps(standing, scene.assertions, Tolerances())
+            return f"not seen: what carries {', '.join(hanging)}" if hanging else ""
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 

@@ -22,7 +22,7 @@ from stages.perception.hypotheses.combinations import (
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
-from stages.perception.hypotheses.revisions import Revision, is_better, refitted, relabelled, revisions
+from stages.perception.hypotheses.revisions import Revision, is_better, new, refitted, relabelled, revisions, suggested
 from stages.perception.observation.preprocessing import preprocess
 
 
@@ -106,6 +106,8 @@ class Hypotheses(Stage):
         best = max(posteriors, key=lambda each: each.log_weight)
         known = max((each.log_weight for each in earlier), default=-np.inf)
         revised: list[Revision] = []
+        if search:
+            search = msgspec.structs.replace(search, offers=(*search.offers, *new(best.suggested, search.offers)))
         if search and search.rounds < self.config.revisions and is_better(best.log_weight, known):
             # What else made the scene better was not in vain.
             several = sum(is_better(each.log_weight, known) for each in posteriors) > 1
@@ -113,6 +115,7 @@ class Hypotheses(Stage):
             revised = revisions(best, search.offers, before)[: self.config.finalists]
             revised += relabelled(best, search.offers, before)[: self.config.finalists]
             revised += [each for each in refitted(best, search.offers) if each not in revised]
+            revised += suggested(best, search.offers)[: self.config.finalists]
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained or fits badly")
             following = msgspec.structs.replace(

@@ -21,6 +21,7 @@ from stages.perception.filter.particle_filter import Track
 from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import charge
 from stages.perception.hypotheses.scene_filter import Found, SceneFilter, Suspect
+from stages.perception.hypotheses.suggestions import Suggestions
 from stages.scene.catalogue import Catalogue
 from stages.scene.naming import unique_names
 
@@ -75,8 +76,10 @@ class ParticleFilter(Stage):
             *config.without
         )
         device = chosen_device(config.device, place="particle_filter.device")
-        self._filter = SceneFilter(Catalogue.shared(config.catalogue), settings, device=device, seed=config.seed)
+        catalogue = Catalogue.shared(config.catalogue)
+        self._filter = SceneFilter(catalogue, settings, device=device, seed=config.seed)
         self._filter.warm_up()
+        self._suggestions = Suggestions(catalogue)
         self._seen: tuple[Observation, ObservedScene] | None = None
 
     def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
@@ -110,13 +113,14 @@ class ParticleFilter(Stage):
         remark = f"above {reached:.1f}, which is reached: dropped" if result.dropped else ""
         ctx.log(f"hypothesis {hypothesis.index + 1} of {hypothesis.count}: cost {result.cost:.1f} {remark}".rstrip())
         tracks = [found.track for found in result.objects]
-        charges = hypothesis.charges + self._charges(scene, hypothesis, tracks)
         # In one that is dropped nobody looks for what has no start.
-        objects = zip(names, hypothesis.candidates, result.objects, strict=False)
+        objects = [_object(*each) for each in zip(names, hypothesis.candidates, result.objects, strict=False)]
+        charges = hypothesis.charges + self._charges(scene, hypothesis, objects, tracks)
+        suggests = search is not None and not result.dropped
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
-            objects=tuple(_object(*each) for each in objects),
+            objects=tuple(objects),
             log_weight=-self.config.lambda_r * (result.cost + sum(charges)),
             traces=tuple(_trace(found.track) for found in result.objects),
             left_out=hypothesis.left_out,
@@ -124,6 +128,7 @@ class ParticleFilter(Stage):
             lambda_r=self.config.lambda_r,
             charges=charges,
             unexplained=result.unexplained,
+            suggested=self._suggestions.of(scene, objects, result.layers) if suggests else (),
             search=search,
         )
 
@@ -135,13 +140,17 @@ class ParticleFilter(Stage):
             self._seen = seen, scene
         return self._seen[1]
 
-    def _charges(self, scene: ObservedScene, hypothesis: Hypothesis, tracks: Sequence[Track]) -> tuple[float, ...]:
-        """What the objects that were looked for among the others cost by being there."""
+    def _charges(
+        self, scene: ObservedScene, hypothesis: Hypothesis, objects: Sequence[ObjectPose], tracks: Sequence[Track]
+    ) -> tuple[float, ...]:
+        """What the objects that were looked for among the others cost by being there; nothing where one must be."""
         first = len(hypothesis.charges)
         new = zip(hypothesis.candidates[first:], tracks[first:], hypothesis.shares, strict=False)
         return tuple(
-            charge(candidate.box, self._start(scene, _suspect(candidate), track), share)
-            for candidate, track, share in new
+            0.0
+            if self._suggestions.carries(scene, objects, k)
+            else charge(candidate.box, self._start(scene, _suspect(candidate), track), share)
+            for k, (candidate, track, share) in enumerate(new, first)
         )
 
     def _start(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Start:

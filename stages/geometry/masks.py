@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.arrays import Floats
+
 Mask = NDArray[np.bool_]
 
 
@@ -23,6 +25,12 @@ def opened(mask: Mask, radius: int) -> Mask:
     """The mask without parts thinner than a disc; single missing readings do not tear it."""
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(1))
     return cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(radius)).astype(bool) & mask
+
+
+def box_of(mask: Mask) -> Floats:
+    """x0, y0, x1, y1 of what is true, in pixels, x1 and y1 exclusive; the mask is not empty."""
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

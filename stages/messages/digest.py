@@ -109,7 +109,7 @@ class Offer(Struct, frozen=True, kw_only=True):
     share: float
     """Of what it claims that its object must explain."""
     instead: bool = False
-    """Whether this is another offer's candidate by a less likely label."""
+    """Whether this is one of several labels of a box, and less likely than another or no likelier."""
 
 
 class Contender(Part, frozen=True, kw_only=True):
@@ -180,6 +180,8 @@ class Posterior(Part, frozen=True, kw_only=True):
     """What each object costs by being there, metres times pixels, where N_c is not known."""
     unexplained: tuple[float, ...] = ()
     """Of every offer of the search: the share of what stands in its box that the scene does not explain."""
+    suggested: tuple[Offer, ...] = ()
+    """What no candidate shows and the scene suggests, where N_c is not known."""
     search: Search | None = None
     """The hypothesis's."""
 

@@ -69,10 +69,12 @@ def supports(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, 
     return {item.name: found[item.name] for item in standing}
 
 
-def hanging(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: Tolerances) -> tuple[str, ...]:
-    """Objects that are said to be on the table and are above it: what carries them was not seen."""
-    on_table = {item.arguments[0] for item in found if item.predicate == "on" and item.arguments[1] == TABLE}
-    return tuple(item.name for item in standing if item.name in on_table and item.z_bottom > tolerances.contact)
+def gaps(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: Tolerances) -> dict[str, float]:
+    """Objects that hang above what is said to carry them, and by how many metres: what really does was not seen."""
+    surfaces = {TABLE: 0.0} | {item.name: item.z_top for item in standing}
+    carriers = {item.arguments[0]: item.arguments[1] for item in found if item.predicate in ("on", "in")}
+    above = {item.name: item.z_bottom - surfaces[carriers[item.name]] for item in standing}
+    return {name: gap for name, gap in above.items() if gap > tolerances.contact}
 
 
 def _supporters(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, dict[str, float]]:

@@ -11,9 +11,9 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, rotate, symmetry_angle
 from stages.perception.confidence.calibration import RIGHT_METRES, RIGHT_RADIANS, Calibration
 from stages.perception.confidence.evidence import CAP, Evidence, Judged, Others, Rival
-from stages.perception.confidence.unexplained import looked_through
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.proposals import Dof, Proposals, distinct_best
+from stages.perception.hypotheses.unexplained import looked_through
 from stages.perception.rendering.rasteriser import Float32s
 from stages.scene.catalogue import CatalogueObject
 

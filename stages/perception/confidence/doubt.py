@@ -19,9 +19,9 @@ from stages.messages.scene import Alternative, ObjectPose, UnknownRegion
 from stages.perception.confidence.calibration import Calibration, cost_of_an_object, hypothesis_probabilities
 from stages.perception.confidence.comparison import Comparison, Model
 from stages.perception.confidence.evidence import ORDINARY_NOISE, Evidence, Judged, Others, Rival
-from stages.perception.confidence.unexplained import Region, is_contradicted, unknown_regions
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.proposals import Dof
+from stages.perception.hypotheses.unexplained import Region, is_contradicted, unknown_regions
 from stages.perception.refinement.refinement import RefinedObject
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue

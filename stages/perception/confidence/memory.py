@@ -11,8 +11,8 @@ from stages.geometry import regions
 from stages.geometry.poses import inverse
 from stages.messages import Observation, SceneGraph
 from stages.messages.scene import SceneObject
-from stages.perception.confidence.unexplained import is_contradicted, looked_through
 from stages.perception.filter.likelihood import ObservedScene, Shape
+from stages.perception.hypotheses.unexplained import is_contradicted, looked_through
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue

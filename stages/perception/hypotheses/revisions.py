@@ -10,6 +10,7 @@ import numpy as np
 
 from stages.messages.digest import Offer, Posterior
 from stages.messages.scene import ObjectPose
+from stages.perception.detection.boxes import intersection_over_union
 
 _OPEN = 0.1
 """Share of what stands in a candidate's box from which on its object may be missing, or stand elsewhere."""
@@ -19,6 +20,8 @@ _UNSEEN = 0.01
 """Visible share of an object up to which it explains nothing."""
 _MISFIT = 1.5
 """How many times as badly as the others (their median) an object fits from which on its label is doubted."""
+_SAME = 0.5
+"""Intersection over union of two boxes from which on they frame the same."""
 _GAIN = 0.01
 """Share of the cost that a round must save for another one to follow."""
 
@@ -76,6 +79,18 @@ def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
     return _instead(best, offers, [k for k, offer in enumerate(offers) if _same_box(offer, doubted)])
 
 
+def suggested(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
+    """Revisions in which what the best scene suggests comes in; those are the last of the offers, which no scene was
+    asked about yet."""
+    everything = tuple(range(len(best.objects)))
+    return [Revision(everything, (k,)) for k in range(len(best.unexplained), len(offers))]
+
+
+def new(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
+    """Those of some suggestions that were not made before."""
+    return [each for each in suggestions if not any(_same(each, offer) for offer in offers)]
+
+
 def is_better(log_weight: float, known: float) -> bool:
     """Whether a scene saves enough of what the best one before costs."""
     return log_weight > (1 - _GAIN) * known
@@ -108,6 +123,16 @@ def _index(item: ObjectPose, offers: Sequence[Offer]) -> int:
     """The offer that an object comes from."""
     return next(k for k, offer in enumerate(offers)
                 if offer.candidate.label == item.label and np.array_equal(offer.candidate.box, item.box))  # fmt: skip
+
+
+def _same(one: Offer, other: Offer) -> bool:
+    """Whether two offers are of one label in about one box, and as much is asked of both."""
+    a, b = one.candidate, other.candidate
+    return (
+        a.label == b.label
+        and one.share == other.share
+        and float(intersection_over_union(a.box[None], b.box[None])[0, 0]) > _SAME
+    )
 
 
 def _same_box(one: Offer, other: Offer) -> bool:

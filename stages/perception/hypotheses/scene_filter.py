@@ -63,6 +63,8 @@ class SceneResult:
     first look saw them."""
     unexplained: tuple[float, ...] = ()
     """Of each box that was asked about: the share of what stands in it that the scene leaves unexplained."""
+    layers: tuple[Float32s, ...] = ()
+    """Inverse depth of each object alone, H x W."""
 
 
 class SceneFilter:
@@ -290,7 +292,7 @@ class SceneFilter:
         self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s], cost: float, *,
         dropped: bool = False,
     ) -> SceneResult:  # fmt: skip
-        return SceneResult(tuple(self._found(scene, tracks, layers)), cost, dropped)
+        return SceneResult(tuple(self._found(scene, tracks, layers)), cost, dropped, layers=tuple(layers))
 
     def _found(self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s]) -> Iterator[Found]:
         for i, track in enumerate(tracks):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.geometry.masks import Mask, dilated, eroded, opened
+from stages.geometry.masks import Mask, box_of, dilated, eroded, opened
 from stages.geometry.poses import rotate
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Float32s
@@ -50,7 +50,7 @@ def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[R
     ``layers`` are the objects' inverse depths, H x W each. Readings within a few pixels of a silhouette do not count:
     there they may be of either side, or of neither.
     """
-    lonely = opened(_unexplained(scene, layers), 1 + _edge(scene) // 2)
+    lonely = opened(unexplained(scene, layers, edge=_edge(scene)), 1 + _edge(scene) // 2)
     count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
     found = [_region(scene, labels == number) for number in range(1, count)]
     # How components are numbered may depend on the number of threads; their order here must not.
@@ -75,8 +75,8 @@ def is_contradicted(share: float) -> bool:
     return share > _CONTRADICTED
 
 
-def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
-    """Readings above the plane away from every surface and every silhouette."""
+def unexplained(scene: ObservedScene, layers: Sequence[Float32s], *, edge: int) -> Mask:
+    """Readings above the plane that lie on no object, and not within ``edge`` pixels of a silhouette, H x W."""
     normal, offset = scene.plane[:3], scene.plane[3]
     above = ((scene.view.rays() * normal).sum(-1) * scene.depth + offset) > _HEIGHT * _growth(scene)
     open_readings = scene.foreground & above
@@ -84,7 +84,7 @@ def _unexplained(scene: ObservedScene, layers: Sequence[Float32s]) -> Mask:
     for layer in layers:
         shown = layer > 0
         on_it = shown & (np.abs(1.0 / np.where(shown, layer, 1.0) - scene.depth) < margin)
-        rim = dilated(shown, _edge(scene)) & ~eroded(shown, _edge(scene))
+        rim = dilated(shown, edge) & ~eroded(shown, edge)
         open_readings &= ~(on_it | rim)
     return open_readings
 
@@ -99,8 +99,7 @@ def _region(scene: ObservedScene, mask: Mask) -> Region | None:
     low, high = np.percentile(rotate(T[:3, :3].T, points), [2, 98], axis=0)
     if high[2] < _TOP:
         return None
-    box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
-    return Region(box, len(rows), (low + high) / 2, high - low)
+    return Region(box_of(mask), len(rows), (low + high) / 2, high - low)
 
 
 def _margin(scene: ObservedScene) -> Floats:
