@@ -63,6 +63,9 @@ class Hypotheses(Stage):
         """Cap on h with first looks, and on the revisions and on the other labels of a round, least cost first."""
         revisions: int = 4
         """Rounds in which the best scene is revised at most, where N_c is not known."""
+        suggestions: bool = False
+        """Whether what no box shows may be any object: what the best scene leaves unexplained beside its objects, and
+        what carries those that hang. For catalogues that hold all that may be there; else it stays unknown."""
         max_height: float = 0.6
         """Metres above the support plane beyond which a reading belongs to no object."""
 
@@ -106,7 +109,7 @@ class Hypotheses(Stage):
         best = max(posteriors, key=lambda each: each.log_weight)
         known = max((each.log_weight for each in earlier), default=-np.inf)
         revised: list[Revision] = []
-        if search:
+        if search and self.config.suggestions:
             search = msgspec.structs.replace(search, offers=(*search.offers, *new(best.suggested, search.offers)))
         if search and search.rounds < self.config.revisions and is_better(best.log_weight, known):
             # What else made the scene better was not in vain.
@@ -115,7 +118,7 @@ class Hypotheses(Stage):
             revised = revisions(best, search.offers, before)[: self.config.finalists]
             revised += relabelled(best, search.offers, before)[: self.config.finalists]
             revised += [each for each in refitted(best, search.offers) if each not in revised]
-            revised += suggested(best, search.offers)[: self.config.finalists]
+            revised += suggested(best, search.offers, before)[: self.config.finalists]
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained or fits badly")
             following = msgspec.structs.replace(

@@ -286,6 +286,32 @@ def test_what_shows_an_object_once_more_may_show_what_carries_it(filter_stage: P
         assert {item.label for item in estimate.objects} == labels
 
 
+def test_what_nothing_explains_is_looked_for_though_no_box_shows_it(filter_stage: ParticleFilter) -> None:
+    """A cup half behind a carton, that the detector does not see at all."""
+    partly = {"cereal_box": upright("cereal_box", 0.0, 0.0, 0.3), "cup": upright("cup", 0.09, 0.09, 0.0)}
+    behind = render(partly)
+    found = candidates(("cereal_box", behind.boxes["cereal_box"], 0.95))
+    for suggestions, labels in ((False, {"cereal_box"}), (True, set(partly))):
+        config = Hypotheses.Config(n_objects="auto", suggestions=suggestions)
+        (observation, *hypotheses), _ = enumerate_(config, frame(behind), found, filter_stage)
+        estimate = ranked(config, hypotheses, filter_stage, observation)
+        assert {item.label for item in estimate.objects} == labels
+    cup = next(item for item in estimate.objects if item.label == "cup")
+    assert np.linalg.norm((cup.T_camera_object - behind.poses["cup"])[:3, 3]) < 0.01
+
+
+def test_what_carries_something_is_found_by_the_gap_below_it(filter_stage: ParticleFilter) -> None:
+    """A can under a box, of which so little shows that no detector sees it."""
+    box = upright("tea_box", 0.0, 0.0, 0.4)
+    box[2, 3] += 0.04
+    tower = render({"tuna_can": upright("tuna_can", -0.005, 0.01, 0.0), "tea_box": box})
+    found = candidates(("tea_box", tower.boxes["tea_box"], 0.95))
+    config = Hypotheses.Config(n_objects="auto", suggestions=True)
+    (observation, *hypotheses), _ = enumerate_(config, frame(tower), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert {item.label for item in estimate.objects} == {"tuna_can", "tea_box"}
+
+
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))

@@ -9,7 +9,7 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.messages.scene import ObjectPose
 
-_SHARED = 0.6
+SHARED = 0.6
 """Share of the smaller of two boxes that lies in the other if both frame one object, or a part of it."""
 _APART = 0.01
 """Metres between the origins of two poses of one object; two of its kind can hardly stand nearer to each other."""
@@ -23,7 +23,7 @@ def distinct(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Fl
     """
     kept: list[int] = []
     for i in range(len(labels)):
-        rivals = (k for k in kept if labels[k] == labels[i] and _shared(boxes[k], boxes[i]) > _SHARED)
+        rivals = (k for k in kept if labels[k] == labels[i] and shared(boxes[k], boxes[i]) > SHARED)
         if not any(places is None or _together(places[k], places[i]) for k in rivals):
             kept.append(i)
     return kept
@@ -46,7 +46,7 @@ def is_same_scene(one: Sequence[ObjectPose], other: Sequence[ObjectPose]) -> boo
     return not left
 
 
-def _shared(a: Floats, b: Floats) -> float:
+def shared(a: Floats, b: Floats) -> float:
     """Share of the smaller box that lies in the other."""
     inside = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None))
     return float(inside / max(min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])), 1e-9))

@@ -11,6 +11,7 @@ import numpy as np
 from stages.messages.digest import Offer, Posterior
 from stages.messages.scene import ObjectPose
 from stages.perception.detection.boxes import intersection_over_union
+from stages.perception.hypotheses.duplicates import SHARED, shared
 
 _OPEN = 0.1
 """Share of what stands in a candidate's box from which on its object may be missing, or stand elsewhere."""
@@ -79,11 +80,16 @@ def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
     return _instead(best, offers, [k for k, offer in enumerate(offers) if _same_box(offer, doubted)])
 
 
-def suggested(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
-    """Revisions in which what the best scene suggests comes in; those are the last of the offers, which no scene was
-    asked about yet."""
+def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
+    """Revisions in which something comes in that the best scene suggests, the last of the offers; nothing in a box that
+    leaves something unexplained itself, of which :func:`revisions` takes care first."""
     everything = tuple(range(len(best.objects)))
-    return [Revision(everything, (k,)) for k in range(len(best.unexplained), len(offers))]
+    boxes = [offers[k].candidate.box for k in _left_open(best, before) if not offers[k].instead]
+    return [
+        Revision(everything, (k,))
+        for k in range(len(best.unexplained), len(offers))
+        if not any(shared(box, offers[k].candidate.box) > SHARED for box in boxes)
+    ]
 
 
 def new(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
