@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -462,7 +462,13 @@ def _summary(error: BaseException) -> str:
 def prepare(task: bytes) -> None:
     """Imports and computes what the process that this is assigned to shares with others, before it is forked."""
     assignment = msgspec.json.decode(task, type=Assignment)
-    node_from_entry(assignment.stage, assignment.entry).prepare()
+    _prepare(assignment.stage, msgspec.json.encode(assignment.entry))
+
+
+@cache
+def _prepare(stage: str, entry: bytes) -> None:
+    """Once for all replicas."""
+    node_from_entry(stage, msgspec.json.decode(entry)).prepare()
 
 
 def main() -> int:

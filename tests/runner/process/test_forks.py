@@ -5,8 +5,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
+import msgspec
+
+from runner.contract import Stage
 from runner.process.forks import clean_environment
+from runner.process.stage_process import Assignment, prepare
 from tests.runner.common.survivors import lives
 from tests.runner.common.waiting import wait_until
 
@@ -110,6 +115,24 @@ show(*said, server(), [(folder / f"{number}.txt").read_text() for number in rang
 """
     ((*codes, server, printed),) = shown(tmp_path, script)
     assert (codes, printed) == ([0, 0, 0], [f"{server}\n", f"{server} {server}\n", f"{server} {server} {server}\n"])
+
+
+class Prepared(Stage):
+    times: ClassVar[list[None]] = []
+
+    @classmethod
+    def prepare(cls, config: None) -> None:
+        cls.times.append(None)
+
+    def on_start(self) -> None: ...
+
+
+def test_a_stage_is_prepared_once_for_all_its_replicas():
+    entry = {"stage": f"{__name__}:Prepared"}
+    assignment = Assignment("run", "endpoint", "folder", "one", entry, seed=0, routes=(), processes=())
+    for replica in range(3):
+        prepare(msgspec.json.encode(msgspec.structs.replace(assignment, replica=replica)))
+    assert len(Prepared.times) == 1
 
 
 def test_fifty_processes_start_at_once(tmp_path: Path):
