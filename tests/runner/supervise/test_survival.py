@@ -347,7 +347,7 @@ def test_what_stages_have_started_dies_with_a_killed_host(tmp_path: Path):
         wait_until(lambda: living(tmp_path) == [])
 
 
-def test_a_family_ends_its_own_processes_and_no_others():
+def test_descendants_are_ended_and_no_others():
     descendants, other = Descendants(), Descendants()
     marks = ("worker/0/1", "worker/0/10", "worker/1/0")
     own = [_sleeper(descendants.mark(path)) for path in marks]
