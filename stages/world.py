@@ -50,6 +50,12 @@ class World(SimulatedRobot):
                 raise Refused(f"world.seed: {self.seed} is negative; choose 0, 1, 2, ...")
             kinds.check(self.suite, self.goal, self.seed)
 
+    @classmethod
+    def prepare(cls, config: Config) -> None:
+        """Reads the catalogue and the robot, which most others need too."""
+        Catalogue.shared(config.catalogue)
+        read_robot(config.robot)
+
     def __init__(self, config: Config) -> None:
         self._config, self._catalogue = config, Catalogue.shared(config.catalogue)
         robot = read_robot(config.robot)

@@ -1,6 +1,7 @@
 """The documents name only what exists."""
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -36,10 +37,11 @@ def test_the_index_names_every_page():
 
 
 def test_the_index_of_benchmarks_names_every_command():
-    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if '"__main__"' in path.read_text()]
-    folders = [path.parent for path in (ROOT / "benchmarks").glob("*/__main__.py")]
+    scripts = [path for path in (ROOT / "benchmarks").glob("*/*.py") if '"__main__"' in path.read_text()]
+    folders = [path.parent for path in (ROOT / "benchmarks").glob("*/*/__main__.py")]
     named = re.findall(r"^\| `(\w+)", (ROOT / "benchmarks" / "README.md").read_text(), re.M)
-    assert {path.stem for path in (*scripts, *folders)} <= set(named)
+    assert {path.stem for path in (*scripts, *folders)} == set(named)
+    assert [name for name in named if find_spec(f"benchmarks.{name}") is None] == []
 
 
 def test_architecture_names_every_stage():

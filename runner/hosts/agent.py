@@ -30,7 +30,7 @@ from runner.hosts.head import (
     network_of,
 )
 from runner.message.packet import Process
-from runner.process.children import Family, Handle, behind, end_process, last_lines
+from runner.process.children import Descendants, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
@@ -81,7 +81,7 @@ class Agent:
         self._bus = Bus(control(name), endpoint, network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
-        self._family = Family()
+        self._descendants = Descendants()
         try:
             return self._take_part()
         finally:
@@ -138,7 +138,7 @@ class Agent:
         )
         log = self._folder / "log" / f"{process.stage}-{process.replica}.txt"
         log_from = log.stat().st_size if log.exists() else 0
-        name, mark = f"{process.stage}.{process.replica}", self._family.mark(process.path)
+        name, mark = f"{process.stage}.{process.replica}", self._descendants.mark(process.path)
         module, data = "runner.process.stage_process", msgspec.json.encode(task)
         handle = self._forks.start(module, name, task=data, log=log, mark=mark)
         self._children[process] = _Child(handle, log, log_from)
@@ -163,7 +163,7 @@ class Agent:
         for process, child in list(self._children.items()):
             if (code := child.handle.poll()) is not None:
                 del self._children[process]
-                if left := self._family.end(process.path):
+                if left := self._descendants.end(process.path):
                     self._say(f"{process.stage}.{process.replica} {behind(left)}")
                 lines = last_lines(child.log, TAIL_LINES, child.log_from)
                 self._report(Ended(process, code, "".join(f"{line}\n" for line in lines)))
@@ -178,7 +178,7 @@ class Agent:
         for child in self._children.values():
             end_process(child.handle, GRACE_SECONDS)
         self._forks.close()
-        if left := self._family.close():
+        if left := self._descendants.close():
             self._say(f"the stages {behind(left)}")
 
     def _say(self, text: str) -> None:

@@ -1,7 +1,7 @@
 """Child processes: how they are started, die with their parent, leave nothing behind and say what went wrong.
 
 As a program, ``children.py PARENT COMMAND...``, it becomes a command that dies with its parent, a process id;
-``children.py after NAME`` waits until stdin is closed and ends all processes of the :class:`Family` of that name.
+``children.py after NAME`` waits until stdin is closed and ends all processes of the :class:`Descendants` of that name.
 """
 
 import contextlib
@@ -96,7 +96,7 @@ class Spawned(subprocess.Popen[bytes]):
 def spawn(module: str, *arguments: str, task: bytes, log: Path, mark: str = "") -> Spawned:
     """Starts ``python -m module`` in a process group of its own, with its task on stdin and its output in a file.
 
-    What it starts in turn carries its ``mark``, see :class:`Family`.
+    What it starts in turn carries its ``mark``, see :class:`Descendants`.
     """
     with log.open("ab") as output:
         child = Spawned(
@@ -119,7 +119,7 @@ def origin(mark: str) -> dict[str, str]:
     return {PARENT: str(os.getpid()), DESCENT: descent, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
-class Family:
+class Descendants:
     """The children of this process with all that descends from them; none of it outlives this process, even killed.
 
     Children die by a signal from the kernel, which what they have started does not get: one more process, the last,
@@ -206,13 +206,13 @@ def is_orphan() -> bool:
     return os.getppid() != int(os.environ.get(PARENT, os.getppid()))
 
 
-def explain_death() -> None:
+def print_where_it_crashes() -> None:
     """Has a crash in native code, and the supervisor's :data:`DUMP`, print where Python was."""
     faulthandler.enable(all_threads=False)
     faulthandler.register(DUMP, all_threads=False)
 
 
-def volunteer_for_oom() -> None:
+def prefer_for_oom_kill() -> None:
     """Makes this process the kernel's choice when memory runs out."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
@@ -255,7 +255,7 @@ def ending(code: int) -> str:
 
 
 def main() -> None:
-    """Becomes the command it is given, which then dies with its parent, or the last process of a :class:`Family`."""
+    """Becomes the command it is given, which then dies with its parent, or the last of a :class:`Descendants`."""
     if sys.argv[1] == _AFTER:
         sys.stdin.read()
         end_descendants(sys.argv[2])

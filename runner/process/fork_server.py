@@ -112,6 +112,7 @@ def _serve(connection: Connection, other_end: Connection) -> None:
     other_end.close()
     os.environ[PARENT] = str(os.getppid())
     die_with_parent()
+    gc.disable()  # what it imports and computes stays
     _show(__name__, os.environ.get(DESCENT, ""))
     with contextlib.suppress(EOFError):
         while True:
@@ -150,6 +151,8 @@ def _start(order: _Order, connection: Connection) -> int:
 def _live(order: _Order, parent: int, connection: Connection, writing: int) -> int:
     """What the new process does, with the fork server's ``connection``, and a pipe to say that it is there."""
     connection.close()
+    gc.freeze()
+    gc.enable()
     _read_from_stdin(order.task)
     os.environ.update(order.environment)
     _show(f"{order.module} {order.name}", order.environment[DESCENT])

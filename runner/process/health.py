@@ -25,7 +25,7 @@ SOURCE = "source"
 """Waits for the world as long as it likes."""
 
 
-class Heart:
+class Heartbeat:
     """Sends a pulse every half second from a thread of its own, whatever the process does meanwhile."""
 
     def __init__(self, process: Process, bus: Bus, say: Callable[[], dict[str, Any]]):

@@ -21,8 +21,8 @@ from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import die_with_parent, explain_death, is_orphan
-from runner.process.health import Heart
+from runner.process.children import die_with_parent, is_orphan, print_where_it_crashes
+from runner.process.health import Heartbeat
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Verdict
 from runner.recording.writer import Manifest, RecordingWriter
@@ -85,7 +85,7 @@ class Recorder:
             "knows": self._on_knows,
         }
         """By the first part of a key."""
-        self._heart = Heart(own, self._bus, lambda: {**self._writer.vitals(), "refused": self._refusals.count})
+        self._heartbeat = Heartbeat(own, self._bus, lambda: {**self._writer.vitals(), "refused": self._refusals.count})
 
     def run(self) -> Verdict:
         """Records until it is stopped."""
@@ -93,14 +93,14 @@ class Recorder:
         self._bus.watch(self._on_presence, self._refusals.refuse)
         self._speaker.start()
         self._taker.start()
-        self._heart.start()
+        self._heartbeat.start()
         if self._presence.wait_for(self._manifest.processes, lambda: is_orphan() or not self._ends.empty()):
             # Zenoh sends to subscribers in the order in which they came: whoever works on a message has it first.
             self._hear(*sorted({f"m/{topic.partition('/')[0]}/*" for topic in self._manifest.topics}))
             self._bus.announce()
         if self._wait_for_the_end():
             self._outlive()
-        self._heart.stop()
+        self._heartbeat.stop()
         self._ended.set()
         self._taker.join()
         self._said.put(None)
@@ -251,7 +251,7 @@ class Recorder:
 def main() -> int:
     """Records the run on stdin until SIGTERM; exits 0 when the recording is complete, its last line on stderr says
     what is missing."""
-    explain_death()
+    print_where_it_crashes()
     die_with_parent(ORPHANED)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # whoever works on a message goes first
     for signum in (signal.SIGINT, signal.SIGHUP):

@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,10 @@ from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, Los
 from runner.message.ids import MessageId, Recent
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import die_with_parent, explain_death, volunteer_for_oom
+from runner.process.children import die_with_parent, prefer_for_oom_kill, print_where_it_crashes
 from runner.process.delivery import Delivery, Stopped
 from runner.process.forks import EXIT_FAILED
-from runner.process.health import Heart
+from runner.process.health import Heartbeat
 from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
 from runner.process.past import bring_back, past_of
 from runner.process.step import Executor, receive, step_time
@@ -127,7 +127,7 @@ class StageProcess:
         self._busy: list[str] = []
         """Names of the handlers that run, the innermost last."""
         self._sent: dict[str, tuple[int, int]] = dict.fromkeys(self._node.type.outputs, (0, 0))
-        self._heart = Heart(self._process, self._bus, self._vitals)
+        self._heartbeat = Heartbeat(self._process, self._bus, self._vitals)
 
     def run(self) -> None:
         """Serves until it is stopped; raises what a handler raises."""
@@ -158,7 +158,7 @@ class StageProcess:
             self._journal_end()
         with self._recorded:
             self._recorded.wait_for(lambda: self._recorded_steps >= self._steps, RECORDED_SECONDS)
-        self._heart.stop()
+        self._heartbeat.stop()
         self._stage.close()
         self._bus.close()
 
@@ -178,7 +178,7 @@ class StageProcess:
         self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
-        self._heart.start()
+        self._heartbeat.start()
         self._bus.announce()
 
     def _vitals(self) -> dict[str, Any]:
@@ -462,14 +462,20 @@ def _summary(error: BaseException) -> str:
 def prepare(task: bytes) -> None:
     """Imports and computes what the process that this is assigned to shares with others, before it is forked."""
     assignment = msgspec.json.decode(task, type=Assignment)
-    node_from_entry(assignment.stage, assignment.entry).prepare()
+    _prepare(assignment.stage, msgspec.json.encode(assignment.entry))
+
+
+@cache
+def _prepare(stage: str, entry: bytes) -> None:
+    """Once for all replicas."""
+    node_from_entry(stage, msgspec.json.decode(entry)).prepare()
 
 
 def main() -> int:
     """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
-    explain_death()
+    print_where_it_crashes()
     die_with_parent()
-    volunteer_for_oom()
+    prefer_for_oom_kill()
     sys.setswitchinterval(SWITCH_SECONDS)
     for signum in (signal.SIGINT, signal.SIGHUP):
         signal.signal(signum, signal.SIG_IGN)

@@ -8,19 +8,26 @@ import struct
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import IO, cast
 
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, MessageIndex, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 
 from runner.contract import Refused
 
 MAX_RECORD = 2**30
 """Bytes; a longer record is taken for a damaged length."""
 POLL_SECONDS = 0.05
+_HEAD = struct.Struct("<BQ")
+"""Of every record: opcode and length."""
+_MESSAGE = struct.Struct("<HIQQ")
+"""What then stands before a message's payload: channel, sequence, log and publish time."""
 
 _BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
 """What the MCAP reader and its decompressors raise on bytes that make no sense."""
@@ -105,14 +112,14 @@ class Container:
 
     def _opened(self, chunk: Chunk, offset: int) -> Iterable[McapRecord]:
         try:
-            return breakup_chunk(chunk, validate_crc=True)
+            return _content(chunk, checked=True)
         except CRCValidationError:
             self._note(offset, "the chunk's checksum does not match its content")
         except _BROKEN as error:
             self._note(offset, f"the chunk cannot be opened: {_reason(error)}")
             return ()
         try:
-            return breakup_chunk(chunk)
+            return _content(chunk, checked=False)
         except _BROKEN as error:
             self._note(offset, f"the chunk cannot be read: {_reason(error)}")
             return ()
@@ -123,9 +130,45 @@ class Container:
             self.damage.append(damage)
 
 
+class _Reader(StreamReader):
+    """Passes over what says where each message lies: all are read."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._stream.read(length)
+            return MessageIndex(0, [])
+        return super()._read_record(opcode, length)
+
+
+def message_head(message: McapMessage) -> bytes:
+    """What stands before the payload of a message, in one piece: the library packs field by field."""
+    head = _HEAD.pack(Opcode.MESSAGE, _MESSAGE.size + len(message.data))
+    return head + _MESSAGE.pack(message.channel_id, message.sequence, message.log_time, message.publish_time)
+
+
 def _records(stream: IO[bytes] | Growing, *, skip_magic: bool = False) -> Iterator[McapRecord]:
     source = cast("IO[bytes]", stream)
-    return StreamReader(source, skip_magic=skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD).records
+    return _Reader(source, skip_magic=skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD).records
+
+
+def _content(chunk: Chunk, *, checked: bool) -> list[McapRecord]:
+    """What a chunk holds; payloads are views into it, for copying them costs more than all else."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=checked)
+    data, at, found = memoryview(stream.read(size)), 0, list[McapRecord]()
+    while at < size:
+        opcode, length = _HEAD.unpack_from(data, at)
+        at, end = at + _HEAD.size, at + _HEAD.size + length
+        if end > size:
+            raise EndOfFile
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
+            payload = cast("bytes", data[at + _MESSAGE.size : end])
+            found.append(McapMessage(channel, log_time, payload, publish_time, sequence))
+        elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+            kind = Channel if opcode == Opcode.CHANNEL else Schema
+            found.append(kind.read(ReadDataStream(BytesIO(data[at:end]))))
+        at = end
+    return found
 
 
 def _reason(error: Exception) -> str:

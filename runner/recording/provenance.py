@@ -50,7 +50,8 @@ HASHED_FILES = 1000
 
 def package_versions() -> dict[str, str]:
     """Every installed package."""
-    return {found.name: found.version for found in sorted(distributions(), key=lambda found: found.name.lower())}
+    found = ((one["Name"], one["Version"]) for one in (installed.metadata for installed in distributions()))
+    return dict(sorted(found, key=lambda named: named[0].lower()))
 
 
 def changes(then: Mapping[str, str], now: Mapping[str, str], names: Iterable[str]) -> Iterator[str]:

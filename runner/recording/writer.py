@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import msgspec
+from mcap._chunk_builder import ChunkBuilder
 from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
+from mcap.records import ChunkIndex, MessageIndex
+from mcap.records import Message as McapMessage
 from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
@@ -27,7 +29,7 @@ from runner.graph.placement import Network
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json_schema, unpack
 from runner.message.ids import MessageId
 from runner.recording import provenance
-from runner.recording.container import Container, hold
+from runner.recording.container import Container, hold, message_head
 from runner.recording.proof import Proof, Record, in_short
 from runner.recording.recording import (
     FORMAT,
@@ -141,7 +143,8 @@ class RecordingWriter:
         self._file = _create(self._path)
         self._index_file = tempfile.TemporaryFile(buffering=0, dir=self._path.parent)  # noqa: SIM115 - see _write_all
         self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
-        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndex(self._index_file)
+        own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
+        vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
         self._writer.start(profile=PROFILE)
         self._writer.add_metadata(RUN, run_metadata(manifest))
         self._writer.flush()
@@ -289,7 +292,7 @@ class RecordingWriter:
             for entry in self._container.entries_at(file, self._proved, end):
                 with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
                     record = unpack(payload_kind(entry.topic), entry.message.data)
-                    yield entry.topic, entry.message.log_time, _named(record)[1]
+                    yield entry.topic, entry.message.log_time, record.id if isinstance(record, Envelope) else record
 
     def _write_verdict(self) -> None:
         self._flush()
@@ -340,6 +343,22 @@ class RecordingWriter:
         topic, record = _named(payload.record)
         with self._proving:
             self._proof.drop(topic, record)
+
+
+class _ChunkBuilder(ChunkBuilder):
+    """What is in a chunk; the times of its messages increase."""
+
+    def add_message(self, message: McapMessage) -> None:
+        if not self.num_messages:
+            self.message_start_time = message.log_time
+        self.message_end_time = message.log_time
+        self.num_messages += 1
+        index = self.message_indices.get(message.channel_id)
+        if index is None:
+            index = self.message_indices[message.channel_id] = MessageIndex(message.channel_id, [])
+        index.records.append((message.log_time, self.record_writer.count))
+        self.record_writer.write(message_head(message))
+        self.record_writer.write(message.data)
 
 
 class _ChunkIndex:

@@ -33,7 +33,7 @@ class Child:
     """By the kernel of this machine, before it was started."""
     log_from: int = 0
     """Where its own lines begin in the log."""
-    condemned: str = ""
+    killed_because: str = ""
     """Why the supervisor kills it."""
     dies_at: float = float("inf")
     replaced_because: str = ""
@@ -46,9 +46,9 @@ class Child:
     """When its link went, on another host."""
 
     def reason(self, newest: Pulse | None = None) -> str:
-        """Why it ended: what it was condemned for, the signal, or the last thing it printed."""
-        if self.condemned:
-            return self.condemned
+        """Why it ended: why it was killed, the signal, or the last thing it printed."""
+        if self.killed_because:
+            return self.killed_because
         code = self.handle.returncode or 0
         if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
             return lines[0]

@@ -147,7 +147,7 @@ class Guardian:
         while time.monotonic() < deadline and any(map(self._publishes, children)):
             time.sleep(LOOK_SECONDS)
         for child in filter(self._publishes, children):
-            child.condemned = child.condemned or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
+            child.killed_because = child.killed_because or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
             end_process(child.handle, 0)
         for child in children:
             self._report_lost(child)
@@ -173,7 +173,7 @@ class Guardian:
         """Says that a process has ended without having journalled that."""
         if child.handle.poll() is None or child.reported:
             return
-        if child.handle.returncode == 0 and not child.condemned and child.process in self._ready:
+        if child.handle.returncode == 0 and not child.killed_because and child.process in self._ready:
             deadline = time.monotonic() + RECORDED_SECONDS
             while child.process not in self._ended and time.monotonic() < deadline:
                 time.sleep(LOOK_SECONDS)
@@ -293,12 +293,12 @@ class Guardian:
         change = child.watch.look(now, pulse, ready=child.process in self._ready or waits)
         if change:
             self._say(f"{name} {change}", "warning")
-        if not child.condemned and (fault := child.watch.fault()):
-            child.condemned, child.dies_at = fault, now + DUMP_SECONDS
+        if not child.killed_because and (fault := child.watch.fault()):
+            child.killed_because, child.dies_at = fault, now + DUMP_SECONDS
             self._say(f"{name} is killed: {fault}", "warning")
             child.handle.send_signal(DUMP)
-        if not child.condemned and now > child.unheard_since + UNHEARD_SECONDS:
-            child.condemned, child.dies_at = "cut off: the run does not hear it any more", now
+        if not child.killed_because and now > child.unheard_since + UNHEARD_SECONDS:
+            child.killed_because, child.dies_at = "cut off: the run does not hear it any more", now
         if now > min(child.dies_at, child.retires_by or child.dies_at):
             child.handle.send_signal(signal.SIGKILL)
 
@@ -308,7 +308,7 @@ class Guardian:
         reason = child.reason(self.pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
-        if child.retires_by is not None and not child.condemned:
+        if child.retires_by is not None and not child.killed_because:
             self._say(f"{name} was {ASKED}", "info")
             self._give_up(child, ASKED)
             return None
@@ -330,7 +330,7 @@ class Guardian:
         child.replaced_because, child.dies_at = reason, time.monotonic()
         self._lose(child, reason)
         self._announce(Restarted(stage=child.process.stage, replica=child.process.replica, reason=reason))
-        if left := self._launch.family.end(child.process.path):
+        if left := self._launch.descendants.end(child.process.path):
             self._say(f"{self._run.name_of(child.process)} {behind(left)}", "warning")
 
     def _start_successor(self, child: Child) -> None:

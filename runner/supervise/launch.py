@@ -9,7 +9,7 @@ from runner.graph.graph import Graph, graph_to_json, node_entry
 from runner.graph.placement import Network
 from runner.hosts.head import Hosts
 from runner.message.packet import Process
-from runner.process.children import Family, spawn
+from runner.process.children import Descendants, spawn
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.process.stage_process import Assignment
@@ -67,7 +67,7 @@ class Launcher:
         self._run = run
         self._hosts = hosts
         self._forks = forks
-        self.family = Family()
+        self.descendants = Descendants()
         """What stages and viewer start here."""
 
     def recorder(self, process: Process) -> Child:
@@ -95,7 +95,7 @@ class Launcher:
         """Starts the viewer on the recording as it grows."""
         log = self._run.directory / "log" / "viewer.txt"
         process = Process("viewer", 0)
-        mark = self.family.mark(process.path)
+        mark = self.descendants.mark(process.path)
         handle = spawn("runner.cli", "view", "--live", str(self._run.recording), task=b"", log=log, mark=mark)
         return Child(process, handle, log)
 
@@ -108,7 +108,7 @@ class Launcher:
         if self._hosts is not None and host is not None and host != self._hosts.network.host:
             handle = self._hosts.start(host, process, task, log)
         else:
-            module, mark = "runner.process.stage_process", self.family.mark(process.path)
+            module, mark = "runner.process.stage_process", self.descendants.mark(process.path)
             data = msgspec.json.encode(task)
             handle = self._forks.start(module, run.name_of(process), task=data, log=log, mark=mark)
         return Child(process, handle, log, log_from=log_from, watch=Watch(run.graph.nodes[process.stage].limits))
@@ -139,4 +139,4 @@ class Launcher:
     def close(self) -> list[str]:
         """Ends what stages and viewer have left behind here, once they have gone; returns the command lines."""
         self._forks.close()
-        return self.family.close()
+        return self.descendants.close()

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.correction import Lab
+from benchmarks.robot.correction import Lab
 from runner.contract import Refused
 from stages.corrector import Corrector, Phase, State
 from stages.estimate import Quiet

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import right_sets, score, table
 from benchmarks.common.datasets import ImageId, Truth, read_truth
-from benchmarks.estimate import Settings, estimate, results
+from benchmarks.comparison.accuracy import right_sets, score, table
+from benchmarks.comparison.estimate import Settings, estimate, results
 from runner.contract import Finished, Refused
 from stages.camera import DatasetCamera
 from stages.detector import RecordedDetections

@@ -48,9 +48,10 @@ def _up(options: argparse.Namespace) -> int:
     from runner.graph.document import read_document
     from runner.graph.placement import refuse_settings
     from runner.process.forks import become_clean
-    from runner.view.views import require_viewer
 
     if options.view:
+        from runner.view.views import require_viewer
+
         require_viewer()
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     document = read_document(options.graph)
@@ -83,13 +84,14 @@ def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
     from runner.page.start import page_beside, require_page
     from runner.process.fork_server import ForkServer
     from runner.supervise.supervisor import Supervisor
-    from runner.view.views import load_views
 
     gc.disable()  # until it forks: what is imported stays
     graph = load_graph(options.graph, options.settings)
     if options.page or graph.page:
         require_page()
     if options.view:
+        from runner.view.views import load_views
+
         load_views(graph)
     forks = ForkServer(lambda text: terminal.show(SUPERVISOR, text, "warning"))
     supervisor = Supervisor(

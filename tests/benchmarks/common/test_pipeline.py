@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.common.datasets import images, parse_ids, read_truth, truths_by_image
 from benchmarks.common.pipeline import STAGES
-from benchmarks.estimate import Settings, bop_graph, estimate, results
+from benchmarks.comparison.estimate import Settings, bop_graph, estimate, results
 from runner.contract import Refused
 from stages.devices.bop_results import Result, read_results
 from stages.devices.clutter import write_clutter

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common.rasterisers import Task, edge_functions, pyrender_loop, torch_edges
-from benchmarks.kernel import CATALOGUE, SHAPES, problem
+from benchmarks.perception.kernel import CATALOGUE, SHAPES, problem
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception import oracle
 

@@ -88,7 +88,7 @@ class Quitter(Stage):
         return Double(value=2 * number.value)
 
 
-class Mourner(Stage):
+class DiesWithAnother(Stage):
     """Dies of the first death that it hears of."""
 
     def on_restarted(self, restarted: Restarted, ctx: Context) -> None:

@@ -5,20 +5,26 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
+import msgspec
+
+from runner.contract import Stage
 from runner.process.forks import clean_environment
+from runner.process.stage_process import Assignment, prepare
 from tests.runner.common.survivors import lives
 from tests.runner.common.waiting import wait_until
 
 SUPERVISOR = """
 import contextlib, json, os, signal, subprocess, sys, tempfile, threading, time
 from pathlib import Path
-from runner.process.children import Family
+from runner.process.children import Descendants
 from runner.process.fork_server import ForkServer
 from runner.process.forks import Forked, Threads, fork
 folder, said = Path(sys.argv[1]), []
 def start(task, name="one", mark=""):
-    return forks.start("tests.runner.process.obedient", name, task=task.encode(), log=folder / f"{name}.txt", mark=mark)
+    log = folder / f"{name}.txt"
+    return forks.start("tests.runner.process.does_its_task", name, task=task.encode(), log=log, mark=mark)
 def server():
     (pid,) = [pid for pid in children() if b"fork_server" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     return pid
@@ -87,7 +93,7 @@ print(json.dumps([*parents, os.getpgid(0) == os.getpid(), open_files, title, sys
     printed = (tmp_path / "arm.0.txt").read_text().splitlines()
     assert (code, said) == (0, [[]])
     assert printed[:3] == ["printed", "by a child", " nothing more"]
-    module = "tests.runner.process.obedient"
+    module = "tests.runner.process.does_its_task"
     assert json.loads(printed[3]) == [pid, str(pid), True, [0, 1, 2], f"{module} arm.0", [module]]
 
 
@@ -110,6 +116,24 @@ show(*said, server(), [(folder / f"{number}.txt").read_text() for number in rang
 """
     ((*codes, server, printed),) = shown(tmp_path, script)
     assert (codes, printed) == ([0, 0, 0], [f"{server}\n", f"{server} {server}\n", f"{server} {server} {server}\n"])
+
+
+class Prepared(Stage):
+    times: ClassVar[list[None]] = []
+
+    @classmethod
+    def prepare(cls, config: None) -> None:
+        cls.times.append(None)
+
+    def on_start(self) -> None: ...
+
+
+def test_a_stage_is_prepared_once_for_all_its_replicas():
+    entry = {"stage": f"{__name__}:Prepared"}
+    assignment = Assignment("run", "endpoint", "folder", "one", entry, seed=0, routes=(), processes=())
+    for replica in range(3):
+        prepare(msgspec.json.encode(msgspec.structs.replace(assignment, replica=replica)))
+    assert len(Prepared.times) == 1
 
 
 def test_fifty_processes_start_at_once(tmp_path: Path):
@@ -169,10 +193,14 @@ def test_what_a_forked_process_leaves_behind_is_found(tmp_path: Path):
     task += "subprocess.Popen(['sleep', '600'], start_new_session=True); pid = os.fork()\n"
     task += "if pid == 0: os.setsid(); time.sleep(600)\nprint('ready', flush=True)"
     script = f"""
-family = Family()
-one, other = start({task!r}, "one", family.mark("one/0/0")), start({task!r}, "other", family.mark("other/0/0"))
+descendants = Descendants()
+one = start({task!r}, "one", descendants.mark("one/0/0"))
+other = start({task!r}, "other", descendants.mark("other/0/0"))
 show(one.wait(), other.wait())
-show(sorted(family.end("one/0/0")), sorted(family.close()))
+show(sorted(descendants.end("one/0/0")), sorted(descendants.close()))
 """
-    found = [["sleep 600", "tests.runner.process.obedient one"], ["sleep 600", "tests.runner.process.obedient other"]]
+    found = [
+        ["sleep 600", "tests.runner.process.does_its_task one"],
+        ["sleep 600", "tests.runner.process.does_its_task other"],
+    ]
     assert shown(tmp_path, script) == [[0, 0], found]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.replays import busy, replay_once
+from benchmarks.runner.replays import busy, replay_once
 from tests.runner.common.runs import TOYS, Run, run
 from tests.runner.replay.test_replay import replay, verify
 

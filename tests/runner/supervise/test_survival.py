@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from runner.message.ids import MessageId
-from runner.process.children import DESCENT, Family
+from runner.process.children import DESCENT, Descendants
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
 from runner.testing import read_until
@@ -160,20 +160,20 @@ def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     assert code == 0, said
 
 
-MOURNER = """
-  mourner:
-    stage: tests.runner.common.survivors:Mourner
+DIES_WITH_ANOTHER = """
+  other:
+    stage: tests.runner.common.survivors:DiesWithAnother
     inputs: {restarted: {from: supervisor.restarted, queue: 1}}
 """
 
 
 def test_who_replaces_the_dead_waits_for_none_of_them(tmp_path: Path):
     graph = tmp_path / "graph.yaml"
-    graph.write_text(DOUBLES.read_text() + MOURNER)
+    graph.write_text(DOUBLES.read_text() + DIES_WITH_ANOTHER)
     settings = ("counter.count=60", "counter.period=0.05", "sink.count=60", "doubler.die_at=2")
     ended = run(graph, tmp_path, *settings)
     assert (ended.code, len(ended.result)) == (0, 60), ended.output
-    assert re.findall(r"(\w+) restarts \(1 of 3\): killed by SIGKILL", ended.output) == ["doubler", "mourner"]
+    assert re.findall(r"(\w+) restarts \(1 of 3\): killed by SIGKILL", ended.output) == ["doubler", "other"]
     assert Recording(ended.recording).verdict.complete
 
 
@@ -347,16 +347,16 @@ def test_what_stages_have_started_dies_with_a_killed_host(tmp_path: Path):
         wait_until(lambda: living(tmp_path) == [])
 
 
-def test_a_family_ends_its_own_processes_and_no_others():
-    family, other = Family(), Family()
+def test_descendants_are_ended_and_no_others():
+    descendants, other = Descendants(), Descendants()
     marks = ("worker/0/1", "worker/0/10", "worker/1/0")
-    own = [_sleeper(family.mark(path)) for path in marks]
-    nested = _sleeper(f"{family.mark('worker/1/0')} {other.mark('worker/0/1')}")
+    own = [_sleeper(descendants.mark(path)) for path in marks]
+    nested = _sleeper(f"{descendants.mark('worker/1/0')} {other.mark('worker/0/1')}")
     foreign = _sleeper(other.mark("worker/0/1"))
-    assert family.end("worker/0/1") == ["sleep 600"]
+    assert descendants.end("worker/0/1") == ["sleep 600"]
     assert [child.wait() for child in own[:1]] == [-signal.SIGTERM]
     assert [child.poll() for child in (*own[1:], nested, foreign)] == [None] * 4
-    assert family.close() == ["sleep 600"] * 3
+    assert descendants.close() == ["sleep 600"] * 3
     assert [child.wait() for child in (*own[1:], nested)] == [-signal.SIGTERM] * 3
     assert foreign.poll() is None
     assert other.close() == ["sleep 600"]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.clutter import sheet
 from benchmarks.common.datasets import images, truths_by_image
+from benchmarks.comparison.clutter import sheet
 from stages.devices.bop import read_dataset
 from stages.devices.clutter import COUNTS, LEAST_VISIBLE, Clutter, Pile, write_clutter
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth

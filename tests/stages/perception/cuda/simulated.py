@@ -18,7 +18,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.cuda import deviation, exchanged, problem, resident
+from benchmarks.perception.cuda import deviation, exchanged, problem, resident
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, log_so3, pose, rotate
 from stages.perception.cuda.batch import Batch, Launch, Look
