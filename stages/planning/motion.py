@@ -64,6 +64,12 @@ class Trajectory:
     velocities: Floats
 
 
+def warm_up(robot: Robot) -> None:
+    """Loads the kernels of inverse kinematics, so that the first motion does not wait for them."""
+    world = CollisionWorld(robot, robot.table, {})
+    solve_ik(world, world.hand(robot.home), seeds=iter([robot.home]))
+
+
 def solve_ik(
     world: CollisionWorld, T_base_hand: Floats, *, seeds: Iterator[Floats], free: bool = True, iterations: int = 60
 ) -> Floats | None:
