@@ -53,6 +53,7 @@ class SimulatedCamera(Stage):
         self._bend = Lens(self._K, (height, width), config.lens, INVERSE)
         self._lens = Lens(self._K, (height, width), config.lens if config.straighten else (), PLUMB_BOB)
         self._camera = SimulatedCamera(Catalogue.shared(config.catalogue), self._robot, config.board)
+        self._camera.warm_up()
         self._looks = 0
 
     @classmethod

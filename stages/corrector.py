@@ -123,6 +123,10 @@ class Corrector(Stage):
         self._robot = read_robot(config.robot)
         self._state = State(due=config.calibrate)
         if config.calibrate:
+            # Motion planning takes half a second to load; whoever only reads a graph does without.
+            from stages.planning.motion import warm_up
+
+            warm_up(self._robot)
             self._surface = RobotSurface(self._robot)
             self._surface.seen((), np.zeros(0), np.eye(4), View(1.0, 1.0, 0.0, 0.0, 4, 4))  # loads the kernel
 
@@ -247,7 +251,6 @@ class Corrector(Stage):
         return asked
 
     def _proposed(self, height: float, boxes: Floats, view: View, ctx: Context) -> Iterator[PostureRequest]:
-        # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.planning.posture import postures_in_view, world_of
 
         robot = self._robot

@@ -48,12 +48,14 @@ class Executor(Stage):
 
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
+        from stages.planning.motion import warm_up
         from stages.planning.posture import PostureRoutine
         from stages.planning.transfer import TransferRoutine
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)
         self._robot = read_robot(config.robot)
+        warm_up(self._robot)
         self._transfers, self._postures = TransferRoutine, PostureRoutine
         self._routine: TransferRoutine | PostureRoutine | None = None
         """The newest one."""

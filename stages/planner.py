@@ -100,11 +100,13 @@ class Planner(Stage):
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.planning.handling import Handling
+        from stages.planning.motion import warm_up
 
         search.check_engine(config.engine)
         self._handling = Handling
         self._config = config
         self._robot = read_robot(config.robot)
+        warm_up(self._robot)
         self._widest = config.gripper_width or self._robot.gripper.widest
         self._catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}

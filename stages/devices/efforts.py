@@ -53,7 +53,8 @@ def levers(model: Any, data: Any, body: int, dofs: Any) -> Floats:
     """Metres between a body and the axes of joints."""
     linear = np.zeros((3, model.nv))
     mujoco.mj_jacBody(model, data, linear, None, body)
-    return np.maximum(np.linalg.norm(linear[:, dofs], axis=0), _SHORTEST_LEVER)
+    moved = linear[:, dofs]
+    return np.maximum(np.sqrt((moved * moved).sum(0)), _SHORTEST_LEVER)
 
 
 class Felt:

@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from stages.devices.efforts import FILTER, Efforts, levers
@@ -19,11 +20,12 @@ PIECE = 0.05
 """Simulated seconds after which a motion lets others in."""
 BRAKE = 0.1
 """Seconds in which the arm comes to a stand."""
-_SETTLE = 0.25
-_GRIPPER_RAMP = 0.6
-"""Seconds over which a new gripper opening is commanded."""
-_GRIPPER_HOLD = 0.3
-"""Seconds for the fingers to stall or arrive."""
+_STROKE = 0.6
+"""Seconds over which the fingers are commanded from closed to open, or back."""
+_SETTLE = 0.3
+"""Seconds in which the arm arrives, and the fingers stall or arrive, at most."""
+_STILL = 0.005
+"""Radians (metres) a second below which a joint stands."""
 
 
 class Servo:
@@ -44,6 +46,10 @@ class Servo:
         self.actuators = {name: k for k, name in moved.items()}
         """By the joint that each moves."""
         self.fingers = np.array([k for k in range(model.nu) if moved.get(k) not in robot.posture])
+        fingers = [model.joint(name) for name in robot.gripper.fingers]
+        self._finger_positions, self._finger_dofs = (
+            np.array([getattr(one, key)[0] for one in fingers]) for key in ("qposadr", "dofadr")
+        )
         self._hand = model.body(robot.gripper.link).id
         self._efforts = Efforts(robot, tuple(robot.posture), balanced=True)
         self._asked = False
@@ -76,7 +82,8 @@ class Servo:
     def opening(self) -> float:
         """Metres between the fingers."""
         gripper = self._robot.gripper
-        return sum(gripper.width(float(self._data.joint(name).qpos[0])) for name in gripper.fingers) / 2
+        positions = self._data.qpos[self._finger_positions].tolist()
+        return sum(map(gripper.width, positions)) / len(positions)
 
     def grip(self, width: float) -> Floats:
         """What is commanded to the actuators of the fingers; their own range need not be that of the joints."""
@@ -90,45 +97,52 @@ class Servo:
         gain = self._model.actuator_gainprm[actuators, 0]
         lag = -self._model.actuator_biasprm[actuators, 2] / gain
         targets, rates, efforts = self._resample(command)
+        commanded = targets + lag * rates + efforts / gain
         arm = np.array([self._robot.body.turns(name) for name in command.joint_names])
-        still, felt = self._data.actuator_force[actuators].copy(), np.zeros(len(actuators))
-        for k, (target, rate, effort) in enumerate(zip(targets, rates, efforts, strict=True), 1):
-            self._data.ctrl[actuators] = target + lag * rate + effort / gain
+        data = self._data
+        # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
+        taken, felt = efforts + data.actuator_force[actuators], np.zeros(len(actuators))
+        for k in range(len(targets)):
+            data.ctrl[actuators] = commanded[k]
             self._step()
-            self.error = max(self.error, float(np.abs(self._data.qpos[addresses] - target).max()))
-            # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
-            outside = self._data.actuator_force[actuators] - still - effort
-            felt += (outside - felt) * self._timestep / FILTER
-            self.force = max(
-                self.force, float((np.abs(felt) / levers(self._model, self._data, self._hand, dofs))[arm].max())
-            )
+            self.error = max(self.error, float(np.abs(data.qpos[addresses] - targets[k]).max()))
+            felt += (data.actuator_force[actuators] - taken[k] - felt) * (self._timestep / FILTER)
+            at_hand = np.abs(felt) / levers(self._model, data, self._hand, dofs)
+            self.force = max(self.force, float(at_hand[arm].max()))
             if self._is_wrong(command.guard):
                 return
-            if k % round(PIECE / self._timestep) == 0:
+            if (k + 1) % round(PIECE / self._timestep) == 0:
                 yield
                 if self._is_wrong(None):
                     return
-        self._data.ctrl[actuators] = targets[-1]
-        yield from self._wait(_SETTLE, command.guard)
+        data.ctrl[actuators] = targets[-1]
+        yield from self._settle(dofs, command.guard)
 
     def _grip(self, width: float) -> Iterator[None]:
         """The fingers stall with limited force at what is between them."""
+        gripper = self._robot.gripper
         start, end = self._data.ctrl[self.fingers].copy(), self.grip(width)
-        pieces = round(_GRIPPER_RAMP / PIECE)
+        stroke = np.abs(self.grip(gripper.open_width) - self.grip(gripper.closed_width)).max()
+        pieces = int(np.ceil(np.abs(end - start).max() / stroke * _STROKE / PIECE))
         for k in range(1, pieces + 1):
             self._data.ctrl[self.fingers] = start + (end - start) * k / pieces
-            yield from self._wait(PIECE, None)
+            yield from self._piece(None)
             if self.stopped:
                 return
-        yield from self._wait(_GRIPPER_HOLD, None)
+        yield from self._settle(self._finger_dofs, None)
 
-    def _wait(self, seconds: float, guard: Guard | None) -> Iterator[None]:
-        for _ in range(round(seconds / PIECE)):
-            for _ in range(round(PIECE / self._timestep)):
-                self._step()
-            yield
-            if self._is_wrong(guard):
+    def _settle(self, dofs: NDArray[np.intp], guard: Guard | None) -> Iterator[None]:
+        """Waits until joints stand, but not for long."""
+        for _ in range(round(_SETTLE / PIECE)):
+            yield from self._piece(guard)
+            if self.stopped or np.abs(self._data.qvel[dofs]).max() < _STILL:
                 return
+
+    def _piece(self, guard: Guard | None) -> Iterator[None]:
+        for _ in range(round(PIECE / self._timestep)):
+            self._step()
+        yield
+        self._is_wrong(guard)
 
     def _is_wrong(self, guard: Guard | None) -> bool:
         """Whether the robot must stop, and why."""

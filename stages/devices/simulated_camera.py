@@ -46,6 +46,15 @@ class SimulatedCamera:
         self._board = board
         self._renderer = Renderer(*robot.camera.size)
 
+    def warm_up(self) -> None:
+        """Draws room and robot once: their meshes take a second to lay out, which the first look does not wait for."""
+        posture = self._robot.posture
+        links = self._links(tuple(posture), np.array(list(posture.values())))
+        items = [*room(self._robot.table, self._robot.floor), *links]
+        camera = Camera(self._K, inverse(self._robot.T_camera_base))
+        self._renderer.color(items, camera, lighting=_ROOM_LIGHT)
+        self._renderer.depth(items, camera)
+
     def image(self, snapshot: Snapshot, T_base_camera: Floats) -> tuple[Rgb, Depth]:
         """The lit colour image (H x W x 3) and the depth image without noise (H x W, metres).
 

@@ -18,6 +18,7 @@ from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of
 
 _TIMESTEP = 0.002
+_SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 _DROP = 0.002
 """Metres above their support at which objects are laid out."""
 _AWAY = (-3.0, 0.5)
@@ -107,7 +108,14 @@ class Simulation:
 
     def touching(self, name: str) -> set[str]:
         """Names of the bodies that an object touches: links of the robot, ``table``, other objects."""
+        # What sleeps has no contacts.
+        self._model.opt.enableflags &= ~_SLEEP
         mujoco.mj_forward(self._model, self._data)
+        self._model.opt.enableflags |= _SLEEP
+        return self._touched(name)
+
+    def _touched(self, name: str) -> set[str]:
+        """The same, as far as contacts are known."""
         bodies = self._model.geom_bodyid[self._data.contact.geom]
         own = self._model.body(name).id
         pairs = bodies[(bodies == own).any(axis=1)]
@@ -116,7 +124,8 @@ class Simulation:
     def held(self) -> str:
         """The object that both fingers touch and nothing else does; empty where there is none."""
         others = {"table", *self.present}
-        touched = {name: self.touching(name) for name in self.present}
+        mujoco.mj_forward(self._model, self._data)
+        touched = {name: self._touched(name) for name in self.present}
         return next((name for name, bodies in touched.items() if len(bodies) > 1 and not bodies & others), "")
 
     def slide(self, factor: float) -> None:
@@ -171,6 +180,8 @@ def scene_model(
     option = spec.option
     option.timestep, option.integrator = _TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+    # What stands still and is not touched costs nothing; whatever comes upon it, or moves what it stands on, wakes it.
+    option.enableflags |= _SLEEP
     # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])

@@ -27,7 +27,7 @@ _LARGEST_JUMP = 0.35
 """Radians between waypoints of a straight hand motion; more means a change of configuration."""
 _STRAIGHT_STEP = 0.01
 """Metres between waypoints of a straight hand motion."""
-FAST = 0.7
+FAST = 0.85
 """Share of the joint limits for free motions."""
 _RESOLUTION = 0.02
 """Largest joint motion between collision checks of a path, radians (metres)."""
@@ -62,6 +62,12 @@ class Trajectory:
     times: Floats
     positions: Floats
     velocities: Floats
+
+
+def warm_up(robot: Robot) -> None:
+    """Loads the kernels of inverse kinematics, so that the first motion does not wait for them."""
+    world = CollisionWorld(robot, robot.table, {})
+    solve_ik(world, world.hand(robot.home), seeds=iter([robot.home]))
 
 
 def solve_ik(

@@ -18,7 +18,6 @@ from stages.messages.task import FailedStage
 from stages.planning.collision import CollisionWorld
 from stages.planning.motion import FAST, arm, densify, free_motion, robot_command, straight_motion
 from stages.planning.pick_place import (
-    HOVER,
     LIFT,
     MARGINS,
     Pick,
@@ -35,15 +34,14 @@ Routine = Generator[RobotCommand, RobotState, "Outcome"]
 Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]
 """Yields commands, receives encoders, returns the failed stage ("" for success) and the reason."""
 
-_SLOW = 0.4
+_SLOW = 0.5
 """Share of the joint limits for motions next to objects."""
-_LOWERING_STEP = 0.002
+_GENTLE, _YIELDS = 0.1, 0.004
+"""The same where a touch is wanted, and radians (metres) that a joint is held back by one: 3 mm at the hand."""
 _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
 _EARLY = 0.025
 """Metres above the target from which on a touch, while an object is lowered, is its support."""
-_CONTACT = 0.001
-"""Metres that the hand must lag behind while it is lowered to count as contact."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
 _PRESS = 12.0
@@ -321,10 +319,15 @@ class TransferRoutine:
 
     def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard, early: float) -> Steps:
         """A touch less than ``early`` metres above the target is the support."""
-        world = at.world
+        world, felt = at.world, False
+        deeper = straight_motion(world, place.lower[-1], raised(place.hand.T_base_hand, _LOWEST), free=False)
+        narrowest, _ = self._held_between(place.hand.grasp)
+        feeling = Guard(narrowest=narrowest, force=_TOUCH, error=_YIELDS)
         try:
             state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
-            q, felt = yield from self._lower_until_contact(world, state, place)
+            if deeper is not None:
+                state = yield from self._do("feel for the support", deeper, speed=_GENTLE, guard=feeling)
+            q = self._arm(state)
         except _BrokenOff as broken:
             # What is held by its rim hangs lower than it was lifted.
             state, q, felt = broken.state, self._arm(broken.state), True
@@ -348,26 +351,6 @@ class TransferRoutine:
         if not (felt or failure[0]):
             return "unknown", f"nothing was felt below {world.carried} where it was let go of"
         return failure
-
-    def _lower_until_contact(
-        self, world: CollisionWorld, state: RobotState, place: Place
-    ) -> Generator[RobotCommand, RobotState, tuple[Floats, bool]]:
-        """Lowers step by step until the support holds the hand back.
-
-        Returns the last commanded posture (J), and whether a support was felt.
-        """
-        q = place.lower[-1]
-        sag = self._lag(world, q, state)
-        narrowest, _ = self._held_between(place.hand.grasp)
-        for height in np.arange(HOVER - _LOWERING_STEP, _LOWEST, -_LOWERING_STEP):
-            step = straight_motion(world, q, raised(place.hand.T_base_hand, height), free=False)
-            if step is None:
-                break
-            state = yield from self._do("feel for the support", step, speed=_SLOW, guard=Guard(narrowest=narrowest))
-            q = step[-1]
-            if self._lag(world, q, state) - sag > _CONTACT:
-                return q, True
-        return q, False
 
     def _open_and_home(self, world: CollisionWorld, q: Floats, width: float) -> Steps:
         """Opens the hand, from ``width`` metres, where there is room for that, else at home."""
@@ -429,10 +412,6 @@ class TransferRoutine:
         """Metres between the fingers while they hold the object, at least and at most."""
         shut = self._robot.gripper.closed_width
         return shut + 0.5 * (grasp.width - shut), grasp.width + _WIDER
-
-    def _lag(self, world: CollisionWorld, q: Floats, state: RobotState) -> float:
-        """Metres that the hand is higher than commanded."""
-        return float(world.hand(self._arm(state))[2, 3] - world.hand(q)[2, 3])
 
     def _arm(self, state: RobotState) -> Floats:
         return arm(self._robot, state)

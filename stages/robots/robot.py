@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,7 +60,7 @@ class Gripper:
     def width(self, finger: float) -> float:
         """Metres between the fingers at a finger joint's position, also a little beyond its range."""
         positions, widths = self.joint_positions, self.widths
-        k = min(max(int(np.searchsorted(positions, finger)), 1), len(positions) - 1)
+        k = min(max(bisect_left(positions, finger), 1), len(positions) - 1)
         slope = (widths[k] - widths[k - 1]) / (positions[k] - positions[k - 1])
         return float(slope * (finger - positions[k - 1]) + widths[k - 1])
 

@@ -255,23 +255,22 @@ def test_a_stop_reaches_the_arm_on_its_way_and_what_it_held_goes_back() -> None:
     assert np.linalg.norm(bench.poses()["soup_can"][:3, 3] - before["soup_can"][:3, 3]) < 0.01
 
 
-@pytest.mark.parametrize(("label", "seconds", "error"), [("lift cup", 7.97, 7971), ("go home", 26.47, 26471)])
+@pytest.mark.parametrize(("label", "seconds", "error"), [("lift cup", 0.2, 7971), ("go home", 2.0, 26471)])
 def test_an_arm_that_is_called_home_right_after_a_stop_gets_there(label: str, seconds: float, error: int) -> None:
     """Stopped while lifting it held the cup where no free motion began; on its way home it felt its own jerk."""
     bench = Bench(1, "breakfast")
-    before, rng, doing = bench.poses(), np.random.default_rng(error), list[str]()
+    before, rng, stopped = bench.poses(), np.random.default_rng(error), list[float]()
     seen = {name: misperceived(T, rng) for name, T in before.items()}
     target = seen["cup"].copy()
     target[1, 3] += 0.1 if target[1, 3] < 0 else -0.1
-    stopping = bench.simulation.time + seconds
 
-    def stop(label: str) -> None:
-        if not doing and bench.simulation.time > stopping:
-            doing.append(label)
+    def stop(doing: str) -> None:
+        if doing == label and not stopped and bench.simulation.time > bench.states[-1].time + seconds:
+            stopped.append(bench.simulation.time)
             bench.world.on_brake(bench.executor.on_stop(Halt(), bench.ctx))
 
     bench.meddle = stop
-    assert bench.transfer(seen, "cup", "table", target).failed_stage == STOPPED and doing == [label]
+    assert bench.transfer(seen, "cup", "table", target).failed_stage == STOPPED
     home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
     assert isinstance(home, Outcome) and (home.success, home.reason, home.held) == (True, "", "")
     assert bench.is_home()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from stages.geometry.arrays import Floats
+from stages.geometry.poses import along
 from stages.perception.observation.plane import height_above, stands_out
 from stages.perception.rendering.kernels import change_of_cost, evidence, gauss_newton
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
@@ -90,8 +91,8 @@ class ObservedScene:
         view = View.of(K, width, height)
         rays = view.rays()
         normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
-        inverse = np.maximum((rays * normal).sum(-1) / (normal * origin).sum(), 0.0)
-        factor = np.sqrt((rays**2).sum(-1)) * (depth > 0)
+        inverse = np.maximum(along(rays, normal) / (normal * origin).sum(), 0.0)
+        factor = np.sqrt(along(rays, rays)) * (depth > 0)
         of_plane = ~foreground & ~stands_out(np.abs(height_above(depth, view, T_camera_table)), depth)
         miss = np.abs(factor * (1.0 / np.maximum(inverse, 1 / _FAR) - depth))
         return ObservedScene(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import pose
+from stages.geometry.poses import along, pose
 from stages.geometry.regions import EMPTY, Region, hull
 from stages.perception.rendering.rasteriser import Float32s, View
 
@@ -59,7 +59,7 @@ def find_plane(
 def height_above(depth: NDArray[np.floating], view: View, T_camera_table: Floats) -> Float32s:
     """Height of every reading above the plane, H x W metres; meaningless where there is no reading."""
     normal, origin = T_camera_table[:3, 2], T_camera_table[:3, 3]
-    slope = (view.rays() * normal).sum(-1)
+    slope = along(view.rays(), normal)
     return (slope * depth - (normal * origin).sum()).astype(np.float32)
 
 
@@ -106,7 +106,8 @@ def _points(depth: Float32s, view: View, objects: Floats) -> Floats:
     points = (view.rays() * depth[..., None])[depth > 0]
     near = np.zeros(len(points), bool)
     for *middle, radius in objects:
-        near |= ((points - middle) ** 2).sum(1) < (radius + _REACH) ** 2
+        offset = points - middle
+        near |= along(offset, offset) < (radius + _REACH) ** 2
     return points[near] if near.any() else points
 
 
@@ -129,7 +130,7 @@ def _scores(planes: Floats, points: Floats, middles: Floats) -> Floats:
     tolerance = noise(points[:, 2])
     scores = np.empty(len(planes))
     for k, plane in enumerate(planes):
-        height = ((points * plane[:3]).sum(1) + plane[3]) / tolerance
+        height = (along(points, plane) + plane[3]) / tolerance
         agreeing = np.clip(1.0 - height**2, 0.0, None).sum() - _BELOW * (height < -1.0).sum()
         standing = (middles * plane[:3]).sum(1) + plane[3]
         scores[k] = agreeing * (0.1 + ((standing > -0.01) & (standing < _TALLEST)).sum())
@@ -150,7 +151,7 @@ def _through(corners: Floats, up: Floats | None) -> Floats:
 
 def _near(plane: Floats, points: Floats, share: float = 1.0) -> NDArray[np.bool_]:
     """Which points lie on a plane, within a share of the noise."""
-    return np.abs((points * plane[:3]).sum(1) + plane[3]) < share * noise(points[:, 2])
+    return np.abs(along(points, plane) + plane[3]) < share * noise(points[:, 2])
 
 
 def _refit(plane: Floats, points: Floats) -> Floats:

@@ -104,7 +104,8 @@ def _compared(
     photograph = crop.cut(rgb.astype(np.float32))
     around = (cv2.dilate(any_pose.astype(np.uint8), _square(_RING * crop.scale)) > 0) & ~any_pose
     empty = np.where(any_pose[..., None], np.median(photograph[around], 0), photograph)
-    pasted = np.where(covered[..., None], _lit(np.stack(drawn), photograph, common), empty)
+    pasted = np.repeat(empty[None], len(poses), 0)
+    _light(pasted, np.stack(drawn), covered, photograph, common)
     inner = _shrunk(any_pose, crop.scale)
     told_apart = _told_apart(pasted[:, inner], settings.alike)
     return _Compared(_likeness(photograph, pasted, inner, reach * crop.scale), told_apart)
@@ -153,14 +154,17 @@ def _square(reach: float) -> NDArray[np.uint8]:
     return np.ones((2 * int(reach) + 1,) * 2, np.uint8)
 
 
-def _lit(paints: Float32s, photograph: Float32s, common: Mask) -> Float32s:
-    """Paints (P x S x S x 3) in the photograph's light: mean of each channel, and contrast, where all poses have paint.
+def _light(images: Float32s, paints: Float32s, covered: Mask, photograph: Float32s, common: Mask) -> None:
+    """Puts paints (P x S x S x 3), where they cover (P x S x S), into images in the photograph's light: mean of each
+    channel, and contrast, where all poses have paint.
 
     One light for all poses: were each free to choose its own, a black lid in bright light would be a white one.
     """
     seen, paint = photograph[common], paints[:, common]
     gain = min(float(seen.std()) / max(float(paint.std()), 1.0), _GAIN)
-    return (paints - paint.mean((0, 1))) * gain + seen.mean(0)
+    dark, bright = paint.mean((0, 1)), seen.mean(0)
+    for image, drawn, where in zip(images, paints, covered, strict=True):
+        image[where] = (drawn[where] - dark) * gain + bright
 
 
 def _told_apart(colors: Float32s, alike: float) -> float:
@@ -188,12 +192,17 @@ def _layer_likeness(layer: Float32s, inner: Mask, reach: float) -> Floats:
     size = layer.shape[1]
     share = cv2.resize(inner.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
     cells = share > min(0.6, 0.9 * float(share.max()))
-    mean, deviation = layer[:, cells].mean((0, 1)), layer[:, cells].std((0, 1))
-    features = (layer - mean) / (deviation + 1e-3)
-    features /= np.sqrt((features**2).sum(-1, keepdims=True))
+    drawn = layer[:, cells]
+    mean, deviation = drawn.mean((0, 1)), drawn.std((0, 1)) + 1e-3
     most = max(1, round(reach * size / _SIDE))
-    seen = np.pad(features[0], ((most, most), (most, most), (0, 0)), mode="edge")
+    seen = np.pad(_directions(layer[0], mean, deviation), ((most, most), (most, most), (0, 0)), mode="edge")
     shifts = [(y, x) for y in range(2 * most + 1) for x in range(2 * most + 1)]
-    drawn = features[1:, cells]
-    fits = [(drawn * seen[y : y + size, x : x + size][cells]).sum(-1).mean(-1) for y, x in shifts]
-    return np.max(fits, 0).astype(np.float64)
+    shifted = np.stack([seen[y : y + size, x : x + size][cells].ravel() for y, x in shifts], 1)
+    fits = _directions(drawn[1:], mean, deviation).reshape(len(layer) - 1, -1) @ shifted
+    return fits.max(1).astype(np.float64) / drawn.shape[1]
+
+
+def _directions(features: Float32s, mean: Float32s, deviation: Float32s) -> Float32s:
+    """Standardised features (... x C) at unit length."""
+    result = (features - mean) / deviation
+    return result / np.sqrt((result**2).sum(-1, keepdims=True))
