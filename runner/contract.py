@@ -48,6 +48,14 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
     version: ClassVar[int] = 1
     starts_lineage: ClassVar[bool] = False
     """True where everything downstream hangs on this message's own id rather than on its cause's."""
+    known_as: ClassVar[str] = ""
+    """The name by which recordings, ports, ids and other processes know this very class (none that derives from it),
+    where it is not its own: a class that is renamed keeps the one that it had."""
+
+
+def name_of(kind: type[Message]) -> str:
+    """The name by which everybody but the source code knows a message class."""
+    return vars(kind).get("known_as") or kind.__name__
 
 
 class Part(Message, frozen=True, kw_only=True):
@@ -139,7 +147,7 @@ class Migration:
 
 
 Migrations = Mapping[tuple[str, int], Migration]
-"""By the class name of a message and the version that the entry leads away from; a graph names its table:
+"""By the name of a message (:func:`name_of`) and the version that the entry leads away from; a graph names its table:
 ``migrations:``."""
 
 

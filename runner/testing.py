@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from runner.contract import Level, Message, Refused, Stage
+from runner.contract import Level, Message, Refused, Stage, name_of
 from runner.graph.document import suggest
 from runner.graph.graph import Edge, Node
 from runner.graph.ports import StageType, inspect_stage, port_name
@@ -187,7 +187,7 @@ class Run:
     def messages(self, kind: type[M]) -> list[M]:
         """Every recorded message of a class, by port and number."""
         recording = Recording(self.recording)
-        ids = (id for id, message in recording.messages.items() if message.type == kind.__name__)
+        ids = (id for id, message in recording.messages.items() if message.type == name_of(kind))
         return [open_envelope(kind, recording.envelope(id)) for id in sorted(ids, key=MessageId.of)]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.messages import Frame
 from stages.perception.detection.views import Views
+from stages.scene.catalogue.loading import written_link
 
 _EXPOSURE, _BALANCE, _GAMMA = 0.35, 0.1, 0.2
 """Natural logarithms by which all colours, each by itself, and the exponent of brightness are off at most."""
@@ -33,6 +34,7 @@ class Objects:
 
 def half(models: Path, views: Views, odd: bool, folder: Path) -> Objects:
     """The objects of a BOP ``models`` folder with odd numbers, or with even ones; the others become unknown."""
+    models = written_link(models) or models
     infos = json.loads((models / "models_info.json").read_text())
     infos = {number: info for number, info in infos.items() if int(number) % 2 == odd}
     found = Objects(folder / "models", learned := folder / "views.safetensors")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from runner.contract import Command, Context, Message, Part, Refused, Stage
+from runner.contract import Command, Context, Message, Part, Refused, Stage, name_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +98,8 @@ def refuse_shared(place: str, ports: Iterable[tuple[str, str]]) -> None:
 
 @cache
 def port_name(kind: type[Message]) -> str:
-    """Snake case of a message type: ``SceneEstimate`` -> ``scene_estimate``."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", kind.__name__).lower()
+    """Snake case of a message's name: ``SceneEstimate`` -> ``scene_estimate``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name_of(kind)).lower()
 
 
 def _handler_names(cls: type[Stage]) -> list[str]:

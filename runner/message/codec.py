@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 import msgspec
 import numpy as np
 
-from runner.contract import Level, Message, Spec
+from runner.contract import Level, Message, Spec, name_of
 from runner.message.ids import IdText
 from runner.message.packet import Process
 
@@ -420,7 +420,7 @@ class Draft(msgspec.Struct, frozen=True):
 def draft(message: Message, *, id: str, lineage: str, time_ns: int, causes: tuple[str, ...]) -> Draft:
     """Wraps a message for its journey; raises CodecError where the message breaks its class or is too large."""
     kind = type(message)
-    cover = Envelope(id, lineage, time_ns, kind.__name__, kind.version, causes, msgspec.Raw())
+    cover = Envelope(id, lineage, time_ns, name_of(kind), kind.version, causes, msgspec.Raw())
     head = pack(cover)
     payload = _encode_after(head, message)
     body = msgspec.Raw(memoryview(payload)[len(head) :].toreadonly())
@@ -434,10 +434,10 @@ def envelope(message: Message, *, id: str, lineage: str, time_ns: int, causes: t
 
 def open_envelope(kind: type[M], sealed: Envelope) -> M:
     """The message inside, which must be of the given class and version."""
-    if sealed.type != kind.__name__:
-        raise CodecError("Envelope", "type", f"expected {kind.__name__}, got {sealed.type[:60]!r}")
+    if sealed.type != (name := name_of(kind)):
+        raise CodecError("Envelope", "type", f"expected {name}, got {sealed.type[:60]!r}")
     if sealed.version != kind.version:
-        raise CodecError("Envelope", "version", f"expected {kind.__name__} {kind.version}, got {sealed.version}")
+        raise CodecError("Envelope", "version", f"expected {name} {kind.version}, got {sealed.version}")
     return decode(kind, sealed.body)
 
 
@@ -481,7 +481,7 @@ def json_schema(kind: type[Message]) -> dict[str, Any]:
     )
     body = definitions.pop(kind.__name__)
     schema = definitions.pop("Envelope")
-    schema["title"], schema["properties"]["body"] = kind.__name__, body
+    schema["title"], schema["properties"]["body"] = name_of(kind), body
     return {**schema, "$defs": definitions} if definitions else schema
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from runner.contract import name_of
 from runner.graph.graph import Graph
 from runner.message.codec import Pulse
 from runner.message.packet import Process
@@ -103,6 +104,6 @@ def topics_of(graph: Graph) -> tuple[TopicStatus, ...]:
     """Every output port of a graph, the supervisor's last."""
     goes_to = graph.destinations()
     return tuple(
-        TopicStatus(topic, kind.__name__, tuple(f"{route.consumer}.{route.input}" for route in goes_to.get(topic, ())))
+        TopicStatus(topic, name_of(kind), tuple(f"{route.consumer}.{route.input}" for route in goes_to.get(topic, ())))
         for topic, kind in graph.topics().items()
     )

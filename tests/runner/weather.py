@@ -1,7 +1,8 @@
 """A weather station whose messages have changed since tests/runner/weather-1.mcap was recorded by an early runner.
 
 Then: ``Reading(celsius, place, unit="C", last=False)``, ``Place(name)`` and ``Forecast(celsius, place, readings,
-last=False)``. Since then a field was renamed, one of a struct inside too, one retired, and three were gained.
+last=False)``. Since then a field was renamed, one of a struct inside too, one retired, and three were gained; and the
+class ``Forecast`` is called ``Outlook``.
 """
 
 from collections.abc import Iterator
@@ -35,7 +36,8 @@ class Reading(Message, frozen=True, kw_only=True):
     last: bool = False
 
 
-class Forecast(Message, frozen=True, kw_only=True):
+class Outlook(Message, frozen=True, kw_only=True):
+    known_as = "Forecast"
     version: ClassVar[int] = 2
     celsius: Vector
     place: Place
@@ -68,16 +70,16 @@ class Forecaster(Stage):
         self._readings = 0
         self._mean = np.zeros(4)
 
-    def on_reading(self, reading: Reading, ctx: Context) -> Forecast:
+    def on_reading(self, reading: Reading, ctx: Context) -> Outlook:
         self._readings += 1
         self._mean = self._mean + (reading.temperature - self._mean) / self._readings
         guess = self._mean + ctx.rng.normal(0, 0.1, 4)
         spread = float(np.ptp(guess))
-        return Forecast(celsius=guess, place=reading.place, readings=self._readings, spread=spread, last=reading.last)
+        return Outlook(celsius=guess, place=reading.place, readings=self._readings, spread=spread, last=reading.last)
 
 
 class Newspaper(Stage):
     device = True
 
-    def on_forecast(self, forecast: Forecast) -> Finished | None:
+    def on_forecast(self, forecast: Outlook) -> Finished | None:
         return Finished(code=0, reason="printed") if forecast.last else None

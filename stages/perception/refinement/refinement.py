@@ -41,6 +41,8 @@ _SLIDES = ((0.012, np.deg2rad(10.0)), (0.005, np.deg2rad(4.0)))
 """Metres and radians by which flips are slid and turned, the greater first."""
 _SIDES = np.array(list(product((0.0, -1.0, 1.0), repeat=3)))
 """Every way to turn and slide, staying first, 27 x 3."""
+_TURNS = 4
+"""Turns by exact symmetries that are polished of each flip."""
 _WINDOW = 1.0
 """Colour is asked about poses that cost at most this share of the mean distance more, for each visible pixel."""
 _NATS = 3.0
@@ -261,15 +263,15 @@ class _Joint:
         """Moves an object to the likeliest of its flips and symmetric turns; whether its shape moved."""
         place = self._place(i)
         poses, odds = self._contenders(i, place)
-        turns = self._models[i].turns if self._settings.colour else np.eye(4)[None]
-        faced = _turned(poses, turns)
+        faced = _turned(poses, self._models[i].turns)
         ups = faced[:, :, :3, 2] @ self._scene.T_camera_table[:3, 2]
         odds = odds[:, None] + self._colours(i, place, faced, rgb) - _ON_ITS_HEAD * (ups < -_UPRIGHT)
-        flip, turn = divmod(int(np.argmax(odds > odds.max() - _TIE)), len(turns))
+        flip, turn = divmod(int(np.argmax(odds > odds.max() - _TIE)), faced.shape[1])
         shape_moved = not np.array_equal(poses[flip], self._poses[i])
         self._move(i, faced[flip, turn])
         self._considered[i] = _considered(poses, odds.max(1), flip)
-        self._facing[i] = _facing(faced[flip], odds[flip], turn) if len(turns) > 1 else None
+        if self._settings.colour and faced.shape[1] > 1:
+            self._facing[i] = _facing(faced[flip], odds[flip], turn)
         return shape_moved
 
     def _contenders(self, i: int, place: _Place) -> tuple[Floats, Floats]:
@@ -278,13 +280,29 @@ class _Joint:
         They are the present pose and its polished flips, no two the same modulo the object's symmetries.
         """
         present = self._poses[i][None]
-        flips = self._flips(i, place)
+        poses = self._best_turns(i, place, np.concatenate([present, self._flips(i, place)]))
         most = place.likelihood.costs(present) + _WINDOW * place.misfit
-        poses = np.concatenate([present, flips[place.likelihood.costs(flips) <= most]])
+        poses = poses[place.likelihood.costs(poses) <= most]
         totals = self._totals(i, place, poses)
         kept = _distinct(poses, totals, self._models[i].item.symmetries.transforms())
         excess = (totals[kept] - totals.min()) / place.misfit
         return poses[kept][excess <= _WINDOW], -_NATS * excess[excess <= _WINDOW]
+
+    def _best_turns(self, i: int, place: _Place, poses: Floats) -> Floats:
+        """Each pose after that of the object's exact symmetries which costs least once polished.
+
+        A scanned mesh is symmetric but for some tenths of a millimetre, and by as much two flips may differ.
+        """
+        turned, rows = _turned(poses, self._models[i].turns), np.arange(len(poses))[:, None]
+        costs = place.likelihood.costs(turned.reshape(-1, 3, 4)).reshape(turned.shape[:2])
+        turned = turned[rows, np.argsort(costs, 1, kind="stable")[:, :_TURNS]].reshape(-1, 3, 4)
+        polished = place.likelihood.refine(
+            turned, place.directions, steps=self._settings.steps, gate=self._settings.gate
+        )
+        ways = np.concatenate([poses[:, None], np.stack([turned, polished], 1).reshape(len(poses), -1, 3, 4)], 1)
+        costs = place.likelihood.costs(ways.reshape(-1, 3, 4)).reshape(ways.shape[:2])
+        costs[:, 0] -= _GAIN * place.visible
+        return ways[rows[:, 0], costs.argmin(1)]
 
     def _flips(self, i: int, place: _Place) -> Floats:
         """Those of the object's flips that are worth a full polish, polished."""

@@ -29,7 +29,7 @@ def read_objects(path: Path) -> dict[str, CatalogueObject]:
     Raises:
         Refused: naming file, line, object, key and valid choices.
     """
-    folder = _written_link(path) or path
+    folder = written_link(path) or path
     if folder.is_dir():
         return _read_bop(folder / "models_info.json")
     if not path.is_file():
@@ -37,7 +37,7 @@ def read_objects(path: Path) -> dict[str, CatalogueObject]:
     return _read_yaml(path)
 
 
-def _written_link(path: Path) -> Path | None:
+def written_link(path: Path) -> Path | None:
     """The folder that a file names by all that it holds: so git writes a link where it may not make one."""
     if path.suffix or not path.is_file() or path.stat().st_size > _LONGEST_PATH:
         return None

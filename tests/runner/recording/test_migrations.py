@@ -5,15 +5,18 @@ import re
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
-from runner.contract import Migration, Refused
-from runner.message.codec import CodecError, Envelope, decode_untyped, open_envelope
+from runner.contract import Migration, Refused, name_of
+from runner.graph.ports import port_name
+from runner.message.codec import CodecError, Envelope, decode_untyped, json_schema, open_envelope
+from runner.message.codec import envelope as envelope_of
 from runner.recording.migrations import migrated, without_gained_fields
 from runner.recording.recording import Recording
 from tests.runner.common.recordings import rewrite
 from tests.runner.replay.test_replay import replay, verify
-from tests.runner.weather import MIGRATIONS, Forecast, Reading
+from tests.runner.weather import MIGRATIONS, Outlook, Place, Reading
 
 OLD = Path(__file__).parents[1] / "weather-1.mcap"
 OTHER = {**MIGRATIONS, ("Reading", 2): Migration(change=lambda fields: {**fields, "humidity": 0.25})}
@@ -25,13 +28,24 @@ def test_an_old_recording_is_read_as_messages_are_today():
     reading = open_envelope(Reading, recording.envelope("thermometer.reading#1"))
     assert (reading.humidity, reading.place.station, reading.place.height) == (0.5, "roof 1", 0.0)
     assert len(reading.temperature) == 4
-    assert open_envelope(Forecast, recording.envelope("forecaster.forecast#11")).spread == 0.0
+    assert open_envelope(Outlook, recording.envelope("forecaster.forecast#11")).spread == 0.0
 
 
 def test_an_old_recording_replays():
     code, said = verify(OLD)
     assert code == 0, said
     assert "12" in said
+
+
+def test_a_class_that_is_renamed_is_known_by_the_name_that_it_had():
+    now = envelope_of(Outlook(celsius=np.zeros(1), place=Place(station="roof"), readings=1),
+                      id="forecaster.forecast#0", lineage="thermometer.reading#0", time_ns=0, causes=())  # fmt: skip
+    assert (now.type, port_name(Outlook), json_schema(Outlook)["title"]) == ("Forecast", "forecast", "Forecast")
+
+    class Longer(Outlook, frozen=True, kw_only=True):
+        days: int
+
+    assert name_of(Longer) == "Longer"
 
 
 def test_what_its_class_has_gained_since_is_no_change():

@@ -107,6 +107,21 @@ def test_colour_does_not_overrule_depth(seen: Rendered, refiner: SceneRefiner) -
     assert turned(found, mug)[0] < 3
 
 
+@pytest.mark.parametrize("quarter", [1, -1])
+def test_a_flip_is_compared_by_the_symmetric_turn_that_fits(monkeypatch: pytest.MonkeyPatch, quarter: int) -> None:
+    box = CATALOGUE["tea_box"]
+    vertices = box.mesh.vertices * [1.0, 31 / 60, 1.0]  # a square section, one side of which bulges by 3 mm
+    front = vertices[:, 1] < -0.0309
+    vertices[front, 1] -= 0.003 * np.cos(np.pi * vertices[front, 0] / 0.062) * np.cos(np.pi * vertices[front, 2] / 0.08)
+    bar = Catalogue({"tea_box": replace(box, mesh=replace(box.mesh, vertices=vertices))})
+    monkeypatch.setattr("tests.stages.perception.scenes.CATALOGUE", bar)
+    seen = render({"tea_box": upright("tea_box", 0.0, 0.0, 0.3)})
+    start = seen.poses["tea_box"] @ pose(exp_so3(np.array([0.0, 0.0, quarter * np.pi / 2])), np.zeros(3))
+    blank = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
+    refined = SceneRefiner(bar, RefinementSettings(colour=False)).refine(seen.scene, blank, [Placed("tea_box", start)])
+    assert turned(refined, seen, bar)[0] < 3
+
+
 def test_what_is_switched_off_in_the_filter_is_off_here(seen: Rendered) -> None:
     settings = RefinementSettings.of(FilterSettings().without("joint refinement", "contact"))
     assert (settings.rounds, settings.contact, settings.colour) == (0, False, FilterSettings().colour)
