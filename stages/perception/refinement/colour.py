@@ -197,8 +197,9 @@ def _layer_likeness(layer: Float32s, inner: Mask, reach: float) -> Floats:
     most = max(1, round(reach * size / _SIDE))
     seen = np.pad(_directions(layer[0], mean, deviation), ((most, most), (most, most), (0, 0)), mode="edge")
     shifts = [(y, x) for y in range(2 * most + 1) for x in range(2 * most + 1)]
-    shifted = np.stack([seen[y : y + size, x : x + size][cells].ravel() for y, x in shifts], 1)
-    fits = _directions(drawn[1:], mean, deviation).reshape(len(layer) - 1, -1) @ shifted
+    shifted = np.stack([seen[y : y + size, x : x + size][cells].ravel() for y, x in shifts])
+    # A matrix product may add up in another order where BLAS has more threads.
+    fits = np.einsum("pk,sk->ps", _directions(drawn[1:], mean, deviation).reshape(len(layer) - 1, -1), shifted)
     return fits.max(1).astype(np.float64) / drawn.shape[1]
 
 

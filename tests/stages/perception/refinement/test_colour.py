@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -94,3 +98,21 @@ def test_a_few_pixels_say_nothing() -> None:
     assert not odds(photograph, shown=few).any()
     alike = likeness(photograph, VIEW, few, POSES[:1], paint=Paint.of(CAN), settings=ColourSettings())
     assert np.isnan(alike)
+
+
+SCRIPT = """
+from tests.stages.perception.painted import painted
+from tests.stages.perception.refinement.test_colour import CAN, POSES, VIEW, odds
+print(odds(painted([(CAN, POSES[2])], VIEW)).tobytes().hex())
+"""
+
+
+def test_no_byte_depends_on_the_number_of_threads() -> None:
+    def printed(threads: int) -> str:
+        counts = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+        script = [sys.executable, "-c", SCRIPT]
+        root = Path(__file__).parents[4]
+        return subprocess.run(script, cwd=root, env=os.environ | counts, text=True, check=True, stdout=-1).stdout
+
+    assert len(alone := printed(1)) > 64
+    assert printed(2) == alone
