@@ -98,6 +98,8 @@ class SceneObject(Struct, frozen=True, kw_only=True):
     facing: float | None = None
     """How likely the object also shows the side that the pose says, as :attr:`ObjectPose.facing`, and 1 where its shape
     has no symmetry; None where nobody looked."""
+    visible: float = 1.0
+    """Share of its silhouette that nothing hid when it was seen last."""
 
 
 class Doubt(Struct, frozen=True, kw_only=True):

@@ -20,6 +20,8 @@ from stages.scene.naming import Named, names_kept, unique_names
 from stages.scene.stance import Stances, standing_of
 
 _TRIANGLES = 500
+_CLEARER = 2.0
+"""How many times as much must show of what is seen now as showed of what was seen before in its place."""
 _CONTENT = 0.5
 """Share of a container's footprint up to which something may stand in it."""
 
@@ -38,7 +40,8 @@ class Memory:
     def complete(self, scene: SceneGraph, known: Mapping[str, SceneObject], observation: Observation) -> SceneGraph:
         """The scene with those ``known`` objects that it lacks and that may still be where they were.
 
-        A stranger at such an object's place is the object, taken for something else because little of it shows.
+        A stranger at such an object's place is the object, taken for something else because little of it shows; but
+        where twice as much shows of the stranger, the object had been the mistake.
         """
         if observation.T_base_camera is None:
             return scene
@@ -48,9 +51,11 @@ class Memory:
         strangers = [item for item in scene.objects if item.name not in known]
         kept, taken = list[SceneObject](), set[str]()
         for item in missing:
-            false = {stranger.name for stranger in strangers if self._overlap(item, stranger, scene)}
+            there = [stranger for stranger in strangers if self._overlap(item, stranger, scene)]
+            false = {stranger.name for stranger in there}
             others = [other for other in scene.objects if other.name not in false]
-            if not self._seen_empty(item, others, observation):
+            mistaken = any(stranger.visible > _CLEARER * item.visible for stranger in there)
+            if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
                 taken |= false
         if not kept:

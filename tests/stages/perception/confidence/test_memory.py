@@ -1,5 +1,6 @@
 """Objects that are not seen stay where they were last seen or placed, unless their place is seen empty."""
 
+import msgspec
 import numpy as np
 
 from stages.geometry.arrays import Floats
@@ -81,6 +82,15 @@ def test_what_was_taken_for_a_stranger_is_what_stood_there() -> None:
     scene = completed(stranger, everything, everything)
     assert names(scene) == ["milk_carton", "cup"]
     assert not any("soup_can" in text for text in asserted(scene))
+
+
+def test_a_stranger_of_which_much_more_shows_is_believed() -> None:
+    """A can that was called a salt shaker while a carton hid most of it."""
+    can = {"soup_can": upright("soup_can", 0.06, 0.05, 0.0)}
+    for visible, expected in ((0.2, ["soup_can"]), (0.8, ["salt_shaker"])):
+        before = known({"salt_shaker": HALF_BEHIND})
+        before = {name: msgspec.structs.replace(item, visible=visible) for name, item in before.items()}
+        assert names(MEMORY.complete(graph(can), before, observation(can))) == expected
 
 
 def test_a_stranger_elsewhere_is_kept() -> None:
