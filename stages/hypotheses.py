@@ -22,7 +22,15 @@ from stages.perception.hypotheses.combinations import (
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import distinct
-from stages.perception.hypotheses.revisions import Revision, is_better, new, refitted, relabelled, revisions, suggested
+from stages.perception.hypotheses.revisions import (
+    Revision,
+    is_better,
+    new_offers,
+    refitted,
+    relabelled,
+    revisions,
+    suggested,
+)
 from stages.perception.observation.preprocessing import preprocess
 
 
@@ -109,8 +117,9 @@ class Hypotheses(Stage):
         best = max(posteriors, key=lambda each: each.log_weight)
         known = max((each.log_weight for each in earlier), default=-np.inf)
         revised: list[Revision] = []
-        if search and self.config.suggestions:
-            search = msgspec.structs.replace(search, offers=(*search.offers, *new(best.suggested, search.offers)))
+        if search:
+            new = new_offers(best.suggested, search.offers)
+            search = msgspec.structs.replace(search, offers=(*search.offers, *new))
         if search and search.rounds < self.config.revisions and is_better(best.log_weight, known):
             # What else made the scene better was not in vain.
             several = sum(is_better(each.log_weight, known) for each in posteriors) > 1
@@ -162,7 +171,7 @@ class Hypotheses(Stage):
             # What shows an object once more may show another one, too.
             *(offer for each in seen for offer in _instead(each)),
         )
-        search = None if number is not None else Search(offers=offers)
+        search = None if number is not None else Search(offers=offers, suggestions=self.config.suggestions)
         for index, chosen in enumerate(combinations):
             yield Hypothesis(
                 index=index,

@@ -116,7 +116,7 @@ class ParticleFilter(Stage):
         # In one that is dropped nobody looks for what has no start.
         objects = [_object(*each) for each in zip(names, hypothesis.candidates, result.objects, strict=False)]
         charges = hypothesis.charges + self._charges(scene, hypothesis, objects, tracks)
-        suggests = search is not None and not result.dropped
+        suggests = search is not None and search.suggestions and not result.dropped
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,

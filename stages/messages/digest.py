@@ -131,6 +131,8 @@ class Search(Struct, frozen=True, kw_only=True):
     """How many these are."""
     unexplained: tuple[float, ...] = ()
     """Of each offer's box what the scene that the round revises leaves unexplained."""
+    suggestions: bool = False
+    """Whether posteriors also say what their scenes suggest."""
 
 
 class Placed(Struct, frozen=True, kw_only=True):
@@ -181,7 +183,7 @@ class Posterior(Part, frozen=True, kw_only=True):
     unexplained: tuple[float, ...] = ()
     """Of every offer of the search: the share of what stands in its box that the scene does not explain."""
     suggested: tuple[Offer, ...] = ()
-    """What no candidate shows and the scene suggests, where N_c is not known."""
+    """What no candidate shows and the scene suggests, where the search asks for it."""
     search: Search | None = None
     """The hypothesis's."""
 

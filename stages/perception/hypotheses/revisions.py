@@ -92,7 +92,7 @@ def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
     ]
 
 
-def new(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
+def new_offers(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
     """Those of some suggestions that were not made before."""
     return [each for each in suggestions if not any(_same(each, offer) for offer in offers)]
 
