@@ -131,10 +131,11 @@ class Planner(Stage):
         if not violated:
             return _answer("satisfied", text)
         if (steps := search.continued(task.then, problem)) and task.goal is taught:
-            targets, again = self._targets(problem, task, taught, ctx), _failed_before(steps, task.avoid)
-            poses = targets.of(steps, self._scene(task), again=again, late=problem.items)
+            targets, scene = self._targets(problem, task, taught, ctx), self._scene(task)
+            poses = targets.of(steps, scene, again=_failed_before(steps, task.avoid), late=problem.items)
             if isinstance(poses, list):
-                return _solved(zip(steps, poses, strict=True), text, problem)
+                left = shortened(zip(steps, poses, strict=True), problem, targets, scene, avoided=task.avoid)
+                return _solved(left, text, problem)
         try:
             self._check(problem, task)
             return self._solve_with_room(problem, task, taught, ctx)

@@ -51,16 +51,20 @@ def shortened(
     *,
     avoided: Collection[str] = (),
 ) -> list[tuple[Step, Floats]]:
-    """Steps with their T_base_targets, without those that the others can do without; ``avoided`` as above."""
-    best, k = list(steps), 0
-    while k < len(best):
-        fewer = _without([step for step, _ in best], k)
+    """Steps with their T_base_targets, without those that the others can do without, at first all of one object's;
+    ``avoided`` as above."""
+
+    def placed(fewer: Sequence[Step]) -> list[tuple[Step, Floats]] | None:
         again = [step for step in fewer if step.key in avoided]
         poses = targets.of(fewer, scene, again=again, late=problem.items) if leads_home(fewer, problem) else None
-        if isinstance(poses, list):
-            best = list(zip(fewer, poses, strict=True))
-        else:
-            k += 1
+        return list(zip(fewer, poses, strict=True)) if isinstance(poses, list) else None
+
+    best, k = list(steps), 0
+    for item in dict.fromkeys(step.item for step, _ in best):
+        best = placed([step for step, _ in best if step.item != item]) or best
+    while k < len(best):
+        fewer = placed(_without([step for step, _ in best], k))
+        best, k = (fewer, k) if fewer else (best, k + 1)
     return best
 
 
