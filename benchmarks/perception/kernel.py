@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from stages.geometry.arrays import Floats
+from stages.geometry.masks import box_of
 from stages.geometry.poses import compose, exp_so3, pose
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
@@ -66,13 +67,8 @@ def _observed(
     plane = ObservedScene.of(blank, blank > 0, K, T_camera_table).plane_inverse
     nearest = np.maximum.reduce([plane, *layers])
     depth = np.where(nearest > 0.25, 1 / np.maximum(nearest, 0.25), 0).astype(np.float32)
-    boxes = [_box((layer > 0) & (layer >= nearest)) for layer in layers]
+    boxes = [box_of((layer > 0) & (layer >= nearest)) for layer in layers]
     return ObservedScene.of(depth, nearest > plane, K, T_camera_table), boxes
-
-
-def _box(mask: np.ndarray[Any, np.dtype[np.bool_]]) -> Floats:
-    rows, columns = np.nonzero(mask)
-    return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
 
 
 def _particles(T: Floats) -> Floats:

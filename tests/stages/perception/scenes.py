@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.geometry.arrays import Floats
+from stages.geometry.masks import box_of
 from stages.geometry.poses import exp_so3, pose
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
@@ -52,11 +53,6 @@ def render(placed: dict[str, Floats], *, noise: float = 0.0015, seed: int = 0) -
     nearest = np.maximum.reduce([plane, *layers.values()])
     depth = np.where(nearest > 0, 1 / np.maximum(nearest, 1e-6), 0) + rng.normal(0, noise, nearest.shape)
     depth = np.where((nearest > 0.3) & (rng.random(nearest.shape) > 0.02), depth, 0).astype(np.float32)
-    boxes = {label: _box((layer > 0) & (layer >= nearest)) for label, layer in layers.items()}
+    boxes = {label: box_of((layer > 0) & (layer >= nearest)) for label, layer in layers.items()}
     foreground = (nearest > plane) & (depth > 0)
     return Rendered(ObservedScene.of(depth, foreground, K, T_camera_table), poses, boxes)
-
-
-def _box(mask: np.ndarray) -> Floats:
-    rows, columns = np.nonzero(mask)
-    return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from stages.geometry.arrays import Floats
+from stages.geometry.masks import box_of
 from stages.messages import Frame
 from stages.perception.detection.views import Views
 from stages.perception.rendering.contact_sheet import looking_at
@@ -62,9 +63,4 @@ def photograph(*names: str) -> Photograph:
     rgb = np.clip(rgb + rng.normal(0, 4, rgb.shape), 0, 255).astype(np.uint8)
     depth = depth + rng.normal(0, 0.001, depth.shape)
     depth = np.where((shown >= 0) & (rng.random(depth.shape) > 0.02), depth, 0).astype(np.float32)
-    return Photograph(rgb, depth, {name: _box(shown == index) for index, name in enumerate(names, 1)})
-
-
-def _box(mask: np.ndarray) -> Floats:
-    rows, columns = np.nonzero(mask)
-    return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
+    return Photograph(rgb, depth, {name: box_of(shown == index) for index, name in enumerate(names, 1)})
