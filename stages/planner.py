@@ -101,9 +101,10 @@ class Planner(Stage):
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.planning.handling import Handling
         from stages.planning.motion import warm_up
+        from stages.planning.unknown import unknown_objects
 
         search.check_engine(config.engine)
-        self._handling = Handling
+        self._handling, self._unknown_objects = Handling, unknown_objects
         self._config = config
         self._robot = read_robot(config.robot)
         warm_up(self._robot)
@@ -280,7 +281,14 @@ class Planner(Stage):
         raise Impossible(_no_room(blocked) if blocked else "no order of transfers leaves room for the hand", blocked)
 
     def _scene(self, task: Task) -> Scene:
-        return Scene.of(task.current, self._stances)
+        """What stands there now, known or not."""
+        graph = task.current
+        scene, T_table_base = Scene.of(graph, self._stances), inverse(graph.T_base_table)
+        objects = {item.name: (self._catalogue[item.label], item.T_base_object) for item in graph.objects}
+        table = replace(self._robot.table, height=float(graph.T_base_table[2, 3]))
+        for name, (box, T) in self._unknown_objects(graph, objects, self._robot, table).items():
+            scene = scene.after(name, Standing.at(name, Stances(box), T_table_base @ T), TABLE)
+        return scene
 
     def _targets(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Targets:
         handling = self._handling(self._robot, self._robot.table, ctx.rng, problem.faced)

@@ -68,6 +68,7 @@ from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue, Mesh
+from stages.scene.naming import region_name
 from stages.scene.relations import TABLE
 from stages.scene.text import SURE, support
 
@@ -425,7 +426,9 @@ def doubt_drawings(estimate: SceneEstimate, catalogue: Catalogue) -> Iterator[Dr
             yield Lines3D(f"world/camera/doubt/{item.name}_contradicted", box, _RED)
     for number, region in enumerate(estimate.unknown):
         low, high = (region.centre_table + sign * region.extent_table / 2 for sign in (-1, 1))
-        yield Lines3D(f"world/camera/doubt/unknown_{number}", _box_edges(low, high, estimate.T_camera_table), _MAGENTA)
+        yield Lines3D(
+            f"world/camera/doubt/{region_name(number)}", _box_edges(low, high, estimate.T_camera_table), _MAGENTA
+        )
 
 
 def _swollen(mesh: Mesh) -> Mesh:

@@ -145,6 +145,8 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
     doubts: tuple[Doubt, ...] = ()
     """Where somebody is there to be asked."""
+    unknown: tuple[UnknownRegion, ...] = ()
+    """What stands there and is no object of the scene, as far as it was seen."""
 
     @property
     def frame(self) -> Literal["base", "table"]:

@@ -27,6 +27,7 @@ from stages.planning.pick_place import (
     planners,
 )
 from stages.planning.rehearsal import Rehearsal
+from stages.planning.unknown import unknown_objects
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 
@@ -112,7 +113,8 @@ class TransferRoutine:
     ) -> None:
         self._request, self._robot, self._rng, self._attempts, self._log = request, robot, rng, attempts, log
         self._table = dataclasses.replace(table, height=float(request.scene.T_base_table[2, 3]))
-        self._objects = {o.name: (catalogue[o.label], o.T_base_object) for o in request.scene.objects}
+        objects = {o.name: (catalogue[o.label], o.T_base_object) for o in request.scene.objects}
+        self._objects = objects | unknown_objects(request.scene, objects, robot, self._table)
         self._tally = _Tally()
         self._under_way: _UnderWay | None = None
         self.in_hand = ""

@@ -24,6 +24,11 @@ class Named:
     """x, y, z in a frame that stays, metres."""
 
 
+def region_name(number: int) -> str:
+    """Of what stands there and is no known object, by its number in the scene, from 0 on."""
+    return f"unknown_{number + 1}"
+
+
 def unique_names(labels: Sequence[str], kept: Sequence[str | None] = ()) -> list[str]:
     """The label for the first of its kind, then ``label_2``, ``label_3``, ... in order.
 

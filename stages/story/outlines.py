@@ -11,6 +11,7 @@ from stages.geometry.poses import inverse
 from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import UnknownRegion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
+from stages.scene.naming import region_name
 from stages.scene.text import SURE
 from stages.story.words import Words
 
@@ -38,11 +39,6 @@ def outlines(estimate: SceneEstimate, catalogue: Catalogue, size: tuple[int, int
         for number, region in enumerate(estimate.unknown)
     )
     return (*found, *regions)
-
-
-def region_name(number: int) -> str:
-    """By which statements refer to something unknown."""
-    return f"unknown_{number}"
 
 
 def surety(item: ObjectPose) -> Surety:

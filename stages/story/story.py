@@ -62,10 +62,11 @@ from stages.messages.task import Question as AskedQuestion
 from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import meant
 from stages.scene.goals import GoalFolder
+from stages.scene.naming import region_name
 from stages.scene.text import support
 from stages.story import reasons
 from stages.story.cards import GOALS, NAME, Remembered, add, card
-from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, region_name, surety
+from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, surety
 from stages.story.words import Words, words_of
 
 DEMONSTRATOR, EXECUTOR, WORLD, CORRECTOR = "demonstrator", "executor", "world", "corrector"

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -28,13 +29,13 @@ from stages.messages import (
     Transfer,
     TransferRequest,
 )
-from stages.messages.scene import SceneObject
+from stages.messages.scene import SceneObject, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.planning.collision import CollisionWorld
 from stages.planning.posture import postures_in_view
 from stages.robots import BUILT_IN, read_robot
 from stages.world import World
-from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, standing
+from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, catalogue, standing
 
 
 @dataclass
@@ -68,11 +69,19 @@ class Bench:
         snapshot = self.world.on_look_request(LookRequest(purpose="test"), self.ctx)
         return dict(zip(snapshot.names, snapshot.T_base_objects, strict=True))
 
-    def transfer(self, poses: dict[str, Floats], name: str, destination: str, target: Floats) -> Outcome:
+    def transfer(
+        self,
+        poses: dict[str, Floats],
+        name: str,
+        destination: str,
+        target: Floats,
+        unknown: tuple[UnknownRegion, ...] = (),
+    ) -> Outcome:
         transfer = Transfer(
             object=name, source="table", destination=destination, T_base_targets=target[None], pick="", place=""
         )
-        request = TransferRequest(transfer=transfer, scene=graph(poses, self.robot.table.height), number=1)
+        scene = msgspec.structs.replace(graph(poses, self.robot.table.height), unknown=unknown)
+        request = TransferRequest(transfer=transfer, scene=scene, number=1)
         outcome = self.played(self.executor.on_transfer_request(request, self.ctx))
         assert isinstance(outcome, Outcome)
         return outcome
@@ -360,6 +369,23 @@ def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> N
     after = bench.poses()
     assert np.linalg.norm(after["cup"][:3, 3] - before["cup"][:3, 3]) < 0.02
     assert after["tea_box"][2, 2] > 0.99
+
+
+def test_what_is_seen_but_not_known_is_kept_clear_of() -> None:
+    bench = Bench(0, "breakfast")
+    before = bench.poses()
+    seen = {name: T for name, T in before.items() if name != "tea_box"}
+    T, extent = before["tea_box"], catalogue()["tea_box"].dimensions
+    region = UnknownRegion(
+        box=np.array([0.0, 0.0, 9.0, 9.0]),
+        points=90,
+        centre_table=np.array([*T[:2, 3], extent[2] / 2]),
+        extent_table=np.array([*np.full(2, np.hypot(*extent[:2])), extent[2]]),
+    )
+    outcome = bench.transfer(seen, "cup", "table", standing("cup", *T[:2, 3]), (region,))
+    assert (outcome.success, outcome.failed_stage) == (False, "place motion")
+    assert outcome.reason == "no free way down to the target"
+    assert bench.poses()["cup"] == pytest.approx(before["cup"], abs=1e-3)
 
 
 def test_what_somebody_puts_in_the_way_home_is_felt_and_another_way_is_found() -> None:

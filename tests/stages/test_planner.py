@@ -13,7 +13,7 @@ from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
-from stages.messages.scene import Side
+from stages.messages.scene import Side, UnknownRegion
 from stages.planner import Planner
 from stages.planning.sight import hidden_share
 from stages.planning.targets import Workspace
@@ -117,6 +117,32 @@ def test_picks_and_places_are_paired():
     assert found.actions == tuple(action for t in found.transfers for action in (t.pick, t.place))
     assert "(pick bowl table)" in found.actions
     assert "(place-in bowl tray)" in found.actions
+
+
+def test_nothing_is_placed_or_taken_where_something_unknown_is():
+    start = Layout().put("tray", 0.12, 0.0, yaw=np.pi / 2).put("cup", 0.0, -0.35)
+    goal = Layout().put("tray", 0.12, 0.0, yaw=np.pi / 2).put("cup", 0.0, 0.0, on="tray")
+    nothing = np.array([0.0, 0.0, 9.0, 9.0])
+    inside = UnknownRegion(
+        box=nothing, points=90, centre_table=np.array([0.12, 0.0, 0.06]), extent_table=np.array([0.07, 0.07, 0.08])
+    )
+    around = UnknownRegion(
+        box=nothing, points=90, centre_table=np.array([0.0, -0.35, 0.1]), extent_table=np.array([0.3, 0.12, 0.2])
+    )
+
+    def planned(*unknown: UnknownRegion) -> Plan:
+        scene = msgspec.structs.replace(start.graph(), unknown=unknown)
+        return planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=scene), Recorded())
+
+    def nearest(found: Plan) -> float:
+        places = (inverse(T_BASE_TABLE) @ found.transfers[0].T_base_targets)[:, :2, 3] - [0.12, 0.0]
+        return float(np.abs(places).max(1).min())
+
+    assert nearest(planned()) < 0.01
+    assert nearest(planned(inside)) > 0.04 + catalogue()["cup"].dimensions[0] / 2
+    refused = planned(around)
+    assert refused.status == "refused"
+    assert "unknown_1 in the way" in refused.reason
 
 
 @pytest.mark.parametrize("side", SIDES)

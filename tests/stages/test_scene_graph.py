@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from runner.contract import Refused
+from stages.messages.scene import UnknownRegion
 from stages.scene_graph import SceneGraphBuilder
 from tests.stages.layouts import CATALOGUE, T_BASE_TABLE, asserted, breakfast, builder
 
@@ -45,6 +46,14 @@ def test_the_surface_that_was_seen_is_passed_on():
     surface = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]])
     estimate = msgspec.structs.replace(breakfast().estimate(), support=surface)
     assert builder().on_scene_estimate(estimate).support is surface
+
+
+def test_what_is_not_known_is_passed_on():
+    region = UnknownRegion(
+        box=np.array([0.0, 0.0, 9.0, 9.0]), points=50, centre_table=np.zeros(3), extent_table=np.full(3, 0.05)
+    )
+    estimate = msgspec.structs.replace(breakfast().estimate(), unknown=(region,))
+    assert builder().on_scene_estimate(estimate).unknown == (region,)
 
 
 def test_objects_that_the_catalogue_does_not_hold_are_refused():

@@ -303,7 +303,7 @@ def test_ghosts_and_boxes_stand_where_they_belong() -> None:
         for item in doubt_drawings(doubtful(), CATALOGUE_DATA)
         if isinstance(item, Lines3D)
     }
-    unknown = lines["world/camera/doubt/unknown_0"]
+    unknown = lines["world/camera/doubt/unknown_1"]
     assert unknown.min(0) == pytest.approx([0.08, 0.17, 0.0]) and unknown.max(0) == pytest.approx([0.12, 0.23, 0.1])
     for path in ("world/camera/doubt/cup_0", "world/camera/doubt/cup_contradicted"):
         local = (lines[path] - T_CAMERA_CUP[:3, 3]) @ T_CAMERA_CUP[:3, :3]
