@@ -124,7 +124,7 @@ class Corrector(Stage):
         self._state = State(due=config.calibrate)
         if config.calibrate:
             # Motion planning takes half a second to load; whoever only reads a graph does without.
-            from stages.planning.motion import warm_up
+            from stages.planning.motion.motion import warm_up
 
             warm_up(self._robot)
             self._surface = RobotSurface(self._robot)
@@ -251,7 +251,7 @@ class Corrector(Stage):
         return asked
 
     def _proposed(self, height: float, boxes: Floats, view: View, ctx: Context) -> Iterator[PostureRequest]:
-        from stages.planning.posture import postures_in_view, world_of
+        from stages.planning.motion.posture import postures_in_view, world_of
 
         robot = self._robot
         home = PostureRequest(

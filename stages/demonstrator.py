@@ -43,9 +43,9 @@ from stages.messages import (
 from stages.messages.scene import SceneObject
 from stages.messages.task import STOPPED
 from stages.perception.confidence.memory import Memory
-from stages.planning.hiding import hiders
-from stages.planning.pddl import goal_pddl
-from stages.planning.placements import Scene
+from stages.planning.places.hiding import hiders
+from stages.planning.places.placements import Scene
+from stages.planning.symbolic.pddl import goal_pddl
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue

@@ -25,8 +25,8 @@ from stages.robots import read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 
 if TYPE_CHECKING:
-    from stages.planning.posture import Homecoming, Motion, PostureRoutine
-    from stages.planning.transfer import Routine, TransferRoutine
+    from stages.planning.motion.posture import Homecoming, Motion, PostureRoutine
+    from stages.planning.motion.transfer import Routine, TransferRoutine
 
 
 class Executor(Stage):
@@ -48,9 +48,9 @@ class Executor(Stage):
 
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
-        from stages.planning.motion import warm_up
-        from stages.planning.posture import PostureRoutine
-        from stages.planning.transfer import TransferRoutine
+        from stages.planning.motion.motion import warm_up
+        from stages.planning.motion.posture import PostureRoutine
+        from stages.planning.motion.transfer import TransferRoutine
 
         self._config = config
         self._catalogue = Catalogue.shared(config.catalogue)

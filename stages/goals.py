@@ -11,7 +11,7 @@ import msgspec
 from runner.contract import Context, Refused, Stage
 from stages.messages import Add, Face, Forget, Frame, Goal, Kept, Loosen, Rename, SceneGraph, Strike
 from stages.messages.arrays import Rgb
-from stages.planning.pddl import goal_pddl
+from stages.planning.symbolic.pddl import goal_pddl
 from stages.scene.facing import faced
 from stages.scene.goals import GoalFolder, check_name, default_folder, loosened, unpacked, without
 

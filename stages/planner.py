@@ -15,13 +15,13 @@ from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
-from stages.planning import search
-from stages.planning.hiding import uncovers
-from stages.planning.pddl import DOMAIN, problem_pddl
-from stages.planning.placements import Placements, Scene
-from stages.planning.problem import TABLE, Problem, cycle, wanted
-from stages.planning.search import Solution, Step
+from stages.planning.places.hiding import uncovers
+from stages.planning.places.placements import Placements, Scene
 from stages.planning.stepwise import shortened, stepwise
+from stages.planning.symbolic import search
+from stages.planning.symbolic.pddl import DOMAIN, problem_pddl
+from stages.planning.symbolic.problem import TABLE, Problem, cycle, wanted
+from stages.planning.symbolic.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
@@ -100,8 +100,8 @@ class Planner(Stage):
     def __init__(self, config: Config) -> None:
         # Motion planning takes half a second to load; whoever only reads a graph does without.
         from stages.planning.handling import Handling
-        from stages.planning.motion import warm_up
-        from stages.planning.unknown import unknown_objects
+        from stages.planning.motion.motion import warm_up
+        from stages.planning.motion.unknown import unknown_objects
 
         search.check_engine(config.engine)
         self._handling, self._unknown_objects = Handling, unknown_objects

@@ -34,8 +34,8 @@ from stages.messages import (
     SceneGraph,
     Snapshot,
 )
-from stages.planning.collision import CollisionWorld
-from stages.planning.motion import restarts, solve_ik
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.motion import restarts, solve_ik
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import Robot, read_robot
 from stages.scene.catalogue import BUILT_IN, Catalogue

@@ -18,8 +18,8 @@ from stages.geometry.camera import intrinsics, project
 from stages.geometry.poses import pose
 from stages.messages.arrays import Rgb
 from stages.perception.rendering.renderer import Camera, Item, Renderer
-from stages.planning.collision import CollisionWorld
-from stages.planning.motion import restarts, solve_ik
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.motion import restarts, solve_ik
 from stages.robots import Robot, read_robot
 
 _ABOVE = 0.05

@@ -12,7 +12,7 @@ import numpy as np
 from stages.devices.servo import Servo
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.collision import add_primitives, add_table, quaternion
+from stages.planning.motion.collision import add_primitives, add_table, quaternion
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of

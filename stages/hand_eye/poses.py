@@ -14,8 +14,8 @@ from stages.geometry.camera import project
 from stages.geometry.poses import exp_so3, inverse, pose, small_motion
 from stages.hand_eye.rig import Rig
 from stages.hand_eye.solving import Sight
-from stages.planning.collision import CollisionWorld, add_table
-from stages.planning.motion import restarts, solve_ik
+from stages.planning.motion.collision import CollisionWorld, add_table
+from stages.planning.motion.motion import restarts, solve_ik
 from stages.robots import Robot
 
 _ENOUGH = 5

@@ -15,8 +15,8 @@ from stages.hand_eye.rig import Rig
 from stages.hand_eye.solving import Fit, Sight, left_out, solve, turns
 from stages.messages import CameraCalibration, Frame, LookRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
-from stages.planning.collision import CollisionWorld
-from stages.planning.motion import arm, free_motion, robot_command
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.motion import arm, free_motion, robot_command
 
 Steps = Generator[RobotCommand | LookRequest, Any, CameraCalibration]
 """Yields what is asked and is sent the answer: a robot state, or a frame."""

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.planning.collision import CollisionWorld
-from stages.planning.pick_place import MARGINS, Errand, PickPlacePlanner
-from stages.planning.placements import Scene
-from stages.planning.search import Step
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.pick_place import MARGINS, Errand, PickPlacePlanner
+from stages.planning.places.placements import Scene
+from stages.planning.symbolic.search import Step
 from stages.robots import Robot, Table
 from stages.scene.stance import Standing
 

@@ -1,7 +1,7 @@
 """Plans made one transfer after the other, each in the scene that those before it leave behind.
 
-The search of :mod:`stages.planning.search` finds the fewest transfers, and learns of room only from steps that had
-none: what it learns it never forgets, and in dense scenes that may rule out every order. Here an object that can go
+The search (:mod:`stages.planning.symbolic.search`) finds the fewest transfers, and learns of room only from steps that
+had none: what it learns it never forgets, and in dense scenes that may rule out every order. Here an object that can go
 where it belongs goes there; where none can, what is in the way of one is put aside, and waits until that one has
 moved. What ends nowhere begins again in another order. Such plans make detours (:func:`shortened`), and may be longer
 than they need be even without them.
@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.planning.placements import Scene
-from stages.planning.problem import TABLE, Problem
-from stages.planning.search import Moves, State, Step, leads_home
+from stages.planning.places.placements import Scene
+from stages.planning.symbolic.problem import TABLE, Problem
+from stages.planning.symbolic.search import Moves, State, Step, leads_home
 from stages.planning.targets import Blocked, Crowded, Next, Targets, neighbours
 
 _STARTS = 6

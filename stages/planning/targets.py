@@ -14,10 +14,10 @@ from runner.contract import Refused
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
-from stages.planning.placements import Placement, Placements, Scene
-from stages.planning.problem import TABLE
-from stages.planning.search import Step
-from stages.planning.sight import hidden_share
+from stages.planning.places.placements import Placement, Placements, Scene
+from stages.planning.places.sight import hidden_share
+from stages.planning.symbolic.problem import TABLE
+from stages.planning.symbolic.search import Step
 from stages.robots import Robot
 from stages.scene.stance import Standing
 

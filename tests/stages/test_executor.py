@@ -31,8 +31,8 @@ from stages.messages import (
 )
 from stages.messages.scene import SceneObject, UnknownRegion
 from stages.messages.task import STOPPED
-from stages.planning.collision import CollisionWorld
-from stages.planning.posture import postures_in_view
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.posture import postures_in_view
 from stages.robots import BUILT_IN, read_robot
 from stages.world import World
 from tests.stages.planning.scenes import CATALOGUE_FILE, ROBOT, catalogue, standing

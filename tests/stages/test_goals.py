@@ -17,8 +17,8 @@ from runner.message.codec import decode, encode
 from runner.supervise.calls import read_command
 from stages.goals import Goals
 from stages.messages import Add, Face, Forget, Goal, Kept, Loosen, Rename, SceneGraph, Strike
-from stages.planning.pddl import goal_pddl
-from stages.planning.problem import Problem
+from stages.planning.symbolic.pddl import goal_pddl
+from stages.planning.symbolic.problem import Problem
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.goals import packed
 from stages.scene.virtual import satisfied

@@ -15,7 +15,7 @@ from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
 from stages.messages.scene import Side, UnknownRegion
 from stages.planner import Planner
-from stages.planning.sight import hidden_share
+from stages.planning.places.sight import hidden_share
 from stages.planning.targets import Workspace
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from stages.planning.collision import CollisionWorld
-from stages.planning.pick_place import MARGINS, Errand, PickPlacePlanner
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.pick_place import MARGINS, Errand, PickPlacePlanner
 from stages.robots import Robot, Table
 from stages.scene.stance import Standing
 

@@ -13,7 +13,7 @@ from stages.hand_eye.poses import Sightlines, nearest_first, proposed
 from stages.hand_eye.rig import Rig
 from stages.hand_eye.routine import too_alike
 from stages.hand_eye.solving import Sight
-from stages.planning.collision import CollisionWorld
+from stages.planning.motion.collision import CollisionWorld
 from stages.robots import read_robot
 from tests.stages.robots.test_robots import FOLDER
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.collision import CollisionWorld
+from stages.planning.motion.collision import CollisionWorld
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 

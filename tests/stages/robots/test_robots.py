@@ -12,7 +12,7 @@ from runner.contract import Refused
 from stages.devices.check_robot import report
 from stages.geometry.camera import project
 from stages.geometry.poses import inverse
-from stages.planning.collision import CollisionWorld
+from stages.planning.motion.collision import CollisionWorld
 from stages.robots import Robot, read_robot
 
 HERE = Path(__file__).parent

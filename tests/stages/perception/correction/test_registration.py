@@ -14,8 +14,8 @@ from stages.perception.correction.body import RobotSurface
 from stages.perception.correction.registration import Posture, Registration, Sight
 from stages.perception.rendering.depth_noise import structured_light
 from stages.perception.rendering.rasteriser import View
-from stages.planning.collision import CollisionWorld
-from stages.planning.posture import postures_in_view
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.posture import postures_in_view
 from stages.robots import BUILT_IN, Robot, read_robot
 from stages.scene.catalogue import BUILT_IN as CATALOGUE
 from stages.scene.catalogue import Catalogue

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import stages.scene
 from runner.contract import Refused
-from stages.planning.collision import add_primitives, quaternion
+from stages.planning.motion.collision import add_primitives, quaternion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Grasp, Primitive, Symmetries
 from stages.scene.catalogue.mesh_shape import axis_rotation, transform
 from stages.scene.catalogue.properties import FINGER_CLEARANCE

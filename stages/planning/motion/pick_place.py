@@ -12,9 +12,9 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, raised
 from stages.messages.task import FailedStage, Transfer
-from stages.planning.collision import CollisionWorld
-from stages.planning.grasps import HandPose, approaches, distinct_grasps, hand_poses
-from stages.planning.motion import free_motion, restarts, solve_ik, straight_motion
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.grasps import HandPose, approaches, distinct_grasps, hand_poses
+from stages.planning.motion.motion import free_motion, restarts, solve_ik, straight_motion
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Grasp
 

@@ -15,9 +15,9 @@ from stages.geometry.poses import inverse, raised
 from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
-from stages.planning.collision import CollisionWorld
-from stages.planning.motion import FAST, arm, densify, free_motion, robot_command, straight_motion
-from stages.planning.pick_place import (
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.motion import FAST, arm, densify, free_motion, robot_command, straight_motion
+from stages.planning.motion.pick_place import (
     LIFT,
     MARGINS,
     Pick,
@@ -26,8 +26,8 @@ from stages.planning.pick_place import (
     Place,
     planners,
 )
-from stages.planning.rehearsal import Rehearsal
-from stages.planning.unknown import unknown_objects
+from stages.planning.motion.rehearsal import Rehearsal
+from stages.planning.motion.unknown import unknown_objects
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, Grasp
 

@@ -10,7 +10,7 @@ import trimesh
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages.scene import SceneGraph, UnknownRegion
-from stages.planning.collision import CollisionWorld
+from stages.planning.motion.collision import CollisionWorld
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Mesh, Primitive, Symmetries
 from stages.scene.naming import region_name

@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from stages.geometry.poses import pose, raised
-from stages.planning.collision import CollisionWorld
-from stages.planning.kinematics import POSITION_TOLERANCE, ROTATION_TOLERANCE
-from stages.planning.motion import (
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.kinematics import POSITION_TOLERANCE, ROTATION_TOLERANCE
+from stages.planning.motion.motion import (
     free_motion,
     is_motion_free,
     restarts,
@@ -137,8 +137,6 @@ def test_the_held_object_collides_too(scene: CollisionWorld) -> None:
 
 
 def test_planning_motions_loads_no_plots() -> None:
-    program = (
-        "import sys, stages.planning.motion; loaded = 'matplotlib' in sys.modules; import matplotlib.pyplot as plt;"
-    )
-    program += "sys.exit(loaded or not plt.plot)"
+    program = "import sys, stages.planning.motion.motion; loaded = 'matplotlib' in sys.modules;"
+    program += "import matplotlib.pyplot as plt; sys.exit(loaded or not plt.plot)"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stages.messages import PostureRequest, RobotCommand, RobotState
-from stages.planning.collision import CollisionWorld
-from stages.planning.posture import PostureRoutine
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.posture import PostureRoutine
 from tests.stages.planning.scenes import ROBOT
 
 SHOWN = np.array([0.328, -0.892, 1.09, -1.761, -2.086, -0.515, 0.36, 1.696])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.geometry import regions
-from stages.planning.sight import hidden_share
+from stages.planning.places.sight import hidden_share
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, stances
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
-from stages.planning.placements import Scene
-from stages.planning.problem import TABLE
-from stages.planning.sight import hidden_share
+from stages.planning.places.placements import Scene
+from stages.planning.places.sight import hidden_share
+from stages.planning.symbolic.problem import TABLE
 from stages.scene.stance import Stances, Standing
 
 _GRID = 0.05

@@ -20,7 +20,7 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import RobotCommand, RobotState
 from stages.messages.robot import Guard
-from stages.planning.collision import CollisionWorld, quaternion
+from stages.planning.motion.collision import CollisionWorld, quaternion
 from stages.robots import Robot
 
 _LARGEST_JUMP = 0.35

@@ -7,7 +7,7 @@ import pytest
 
 from stages.geometry.poses import inverse
 from stages.messages import Transfer
-from stages.planning.pick_place import planners
+from stages.planning.motion.pick_place import planners
 from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
 
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.planning.kinematics import Chain
+from stages.planning.motion.kinematics import Chain
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Primitive
 

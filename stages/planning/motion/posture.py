@@ -12,8 +12,8 @@ from stages.geometry.camera import project
 from stages.geometry.poses import pose, random_rotations
 from stages.messages import Arrived, Outcome, PostureRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
-from stages.planning.collision import AMPLE, CollisionWorld
-from stages.planning.motion import arm, free_motion, restarts, robot_command, solve_ik
+from stages.planning.motion.collision import AMPLE, CollisionWorld
+from stages.planning.motion.motion import arm, free_motion, restarts, robot_command, solve_ik
 from stages.robots import Robot
 from stages.scene.catalogue import Primitive
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.geometry.arrays import Floats
 from stages.messages.scene import SceneGraph
-from stages.planning.problem import TABLE, Problem
+from stages.planning.symbolic.problem import TABLE, Problem
 
 DOMAIN = """\
 ; Picking and placing on a table. Items rest on convex items and on the table, and in concave items.

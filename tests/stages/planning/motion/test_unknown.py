@@ -7,8 +7,8 @@ import pytest
 from stages.geometry.arrays import Floats
 from stages.messages import SceneGraph
 from stages.messages.scene import UnknownRegion
-from stages.planning.collision import CollisionWorld
-from stages.planning.unknown import unknown_objects
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.unknown import unknown_objects
 from stages.scene.stance import yawed
 from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
 

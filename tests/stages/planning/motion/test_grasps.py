@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.arrays import Floats
-from stages.planning.grasps import HandPose, distinct_grasps, hand_poses
+from stages.planning.motion.grasps import HandPose, distinct_grasps, hand_poses
 from tests.stages.planning.scenes import TABLE, catalogue, standing
 
 GRASPABLE = [name for name, entry in catalogue().objects.items() if entry.grasps]

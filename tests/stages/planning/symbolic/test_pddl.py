@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from unified_planning.io import PDDLReader
 from unified_planning.shortcuts import get_environment
 
-from stages.planning.pddl import DOMAIN, goal_pddl, problem_pddl, symbol
-from stages.planning.problem import Problem
+from stages.planning.symbolic.pddl import DOMAIN, goal_pddl, problem_pddl, symbol
+from stages.planning.symbolic.problem import Problem
 from tests.stages.layouts import Layout, breakfast
 
 get_environment().credits_stream = None

@@ -5,9 +5,9 @@ import pytest
 
 from stages.geometry import regions
 from stages.geometry.poses import raised
-from stages.planning.hiding import hiders, uncovers
-from stages.planning.placements import Scene
-from stages.planning.problem import TABLE
+from stages.planning.places.hiding import hiders, uncovers
+from stages.planning.places.placements import Scene
+from stages.planning.symbolic.problem import TABLE
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, stances
 

@@ -12,8 +12,8 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.geometry.regions import Region
 from stages.messages.scene import SceneGraph
-from stages.planning.problem import TABLE, carriers
-from stages.planning.search import Step
+from stages.planning.symbolic.problem import TABLE, carriers
+from stages.planning.symbolic.search import Step
 from stages.scene.catalogue import CatalogueObject
 from stages.scene.facing import sides, turned_to
 from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed

@@ -10,9 +10,9 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import RobotCommand, Transfer
-from stages.planning.collision import CollisionWorld
-from stages.planning.motion import free_motion, robot_command
-from stages.planning.pick_place import PickPlace, PickPlacePlanner, planners
+from stages.planning.motion.collision import CollisionWorld
+from stages.planning.motion.motion import free_motion, robot_command
+from stages.planning.motion.pick_place import PickPlace, PickPlacePlanner, planners
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject
 

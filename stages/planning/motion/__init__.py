@@ -1,0 +1,1 @@
+"""What the arm does: grasps and paths without collisions, in the scene as it is perceived, and their execution."""

@@ -1,0 +1,1 @@
+"""Where objects could be put, what would be hidden there, and what hides others now."""
