@@ -92,7 +92,7 @@ def with_features(path: Path) -> Path:
     stages["features"] = {
         "stage": "benchmarks.robot.paper.stages:FeatureScene",
         "config": {"catalogue": "${world.catalogue}", "n_objects": _OBJECTS},
-        "inputs": {"frame": "camera.frame", "candidates": "detector.candidates"},
+        "inputs": {port: content["stages"]["hypotheses"]["inputs"][port] for port in ("frame", "candidates")},
     }
     text = yaml.safe_dump({**content, "name": "proof", "stages": stages}, sort_keys=False)
     for stage in ("hypotheses", "refiner"):

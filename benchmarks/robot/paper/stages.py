@@ -1,4 +1,4 @@
-"""Perception of the paper's proof of concept: poses from features instead of DIGEST, upright objects, known labels."""
+"""Perception of the paper's proof of concept: poses from features instead of DIGEST, with known labels."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class FeatureScene(Stage):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
-        """Which baseline, and how objects may stand."""
+        """Which baseline."""
 
         catalogue: Path = BUILT_IN
-        method: str = "fpfh"
+        method: str = "ppf"
         n_objects: int = 6
         max_height: float = 0.6
         """Metres above the support plane beyond which a reading belongs to no object."""
@@ -49,7 +49,7 @@ class FeatureScene(Stage):
         yield seen
         known = msgspec.structs.replace(candidates, candidates=tuple(best.values()))
         image = Image(msgspec.structs.replace(frame, n_objects=self.config.n_objects), known, ())
-        found = self._estimate(image, self._catalogue, dof=3)
+        found = self._estimate(image, self._catalogue, dof=6)
         yield SceneEstimate(
             objects=tuple(
                 ObjectPose(

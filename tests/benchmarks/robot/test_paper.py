@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import yaml
 
 from benchmarks.robot.episodes import Episode
 from benchmarks.robot.paper.__main__ import EXPERIMENTS, Experiment, failures, table, with_features
@@ -21,6 +22,8 @@ def test_the_proof_of_concept_is_the_main_job_without_digest(tmp_path: Path) -> 
     graph = load_graph(with_features(tmp_path / "proof.yaml"), ("world.goal=lunch",))
     assert {"features", "world", "planner", "executor", "report"} <= set(graph.nodes)
     assert not set(graph.nodes) & {"hypotheses", "particle_filter", "ranker", "refiner"}
+    written = yaml.safe_load((tmp_path / "proof.yaml").read_text())["stages"]
+    assert written["features"]["inputs"] == {"frame": "corrector.frame", "candidates": "detector.candidates"}
 
 
 def episode(*, restored: bool, claimed: bool) -> Episode:
