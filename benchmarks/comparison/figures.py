@@ -66,9 +66,7 @@ def draw(path: Path, title: str, methods: Mapping[str, Sequence[Score]]) -> None
     for panel in panels[:, 0]:
         panel.set_ylabel("accuracy, % of objects", fontsize=10, color="#444444")
     handles, labels = panels.flat[0].get_legend_handles_labels()
-    columns = -(-len(labels) // 2) if len(labels) > 4 else len(labels)
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=11,
-                  handlelength=3.2)  # fmt: skip
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=11, handlelength=3.2)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
