@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 from PIL import Image, ImageDraw
 
@@ -25,7 +24,7 @@ from benchmarks.robot.episodes import HEADER, ROOT, Episode, row, run
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from stages.devices.suites.tray import GOALS
-from stages.messages import Frame, Snapshot
+from stages.messages import Frame
 from stages.messages.arrays import Rgb
 
 _GRAPH = ROOT / "graph.yaml"
@@ -151,16 +150,10 @@ def sheet(experiment: Experiment, episodes: Sequence[Episode]) -> Image.Image:
 
 def views(episode: Episode) -> dict[str, Rgb]:
     """What the camera saw of the goal, of the start and at the end."""
-    recording = Recording(episode.recording)
-    purposes: list[str] = []
-    frames: list[Rgb] = []
-    for envelope in recording.envelopes():
-        if envelope.type == Snapshot.__name__:
-            purposes.append(open_envelope(Snapshot, envelope).purpose)
-        elif envelope.type == Frame.__name__:
-            frames.append(np.asarray(open_envelope(Frame, envelope).rgb))
-    later = [i for i, purpose in enumerate(purposes[: len(frames)]) if not purpose.startswith("goal")]
-    return {"goal": frames[0], "start": frames[later[0]], "end": frames[later[-1]]}
+    corrected = (each for each in Recording(episode.recording).envelopes() if each.id.startswith("corrector.frame#"))
+    frames = [open_envelope(Frame, envelope) for envelope in corrected]
+    goal, *later = [frame for i, frame in enumerate(frames) if i == 0 or not frame.name.startswith("goal")]
+    return {"goal": goal.rgb, "start": later[0].rgb, "end": later[-1].rgb}
 
 
 if __name__ == "__main__":
