@@ -152,8 +152,8 @@ def views(episode: Episode) -> dict[str, Rgb]:
     """What the camera saw of the goal, of the start and at the end."""
     corrected = (each for each in Recording(episode.recording).envelopes() if each.id.startswith("corrector.frame#"))
     frames = [open_envelope(Frame, envelope) for envelope in corrected]
-    goal, *later = [frame for i, frame in enumerate(frames) if i == 0 or not frame.name.startswith("goal")]
-    return {"goal": goal.rgb, "start": later[0].rgb, "end": later[-1].rgb}
+    later = [frame for frame in frames if not frame.name.startswith("goal")]
+    return {"goal": frames[0].rgb, "start": later[0].rgb, "end": later[-1].rgb}
 
 
 if __name__ == "__main__":

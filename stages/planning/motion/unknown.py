@@ -12,7 +12,7 @@ from stages.geometry.poses import inverse
 from stages.messages.scene import SceneGraph, UnknownRegion
 from stages.planning.motion.collision import CollisionWorld
 from stages.robots import Robot, Table
-from stages.scene.catalogue import CatalogueObject, Mesh, Primitive, Symmetries
+from stages.scene.catalogue import ASYMMETRIC, CatalogueObject, Mesh, Primitive
 from stages.scene.naming import region_name
 
 Placed = tuple[CatalogueObject, Floats]
@@ -64,7 +64,7 @@ def _box(region: UnknownRegion, T_base_table: Floats) -> Placed:
         label=0,
         mesh=Mesh(np.asarray(shape.vertices), np.asarray(shape.faces, np.int32), np.zeros((8, 3), np.uint8)),
         concave=False,
-        symmetries=Symmetries(np.empty((0, 4, 4)), (), np.empty((0, 4, 4))),
+        symmetries=ASYMMETRIC,
         mass=1.0,
         friction=1.0,
         resting=(np.eye(3),),

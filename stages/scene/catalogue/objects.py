@@ -81,6 +81,10 @@ class Symmetries:
         return np.einsum("sij,tjk->stik", discrete, turns).reshape(-1, 4, 4)
 
 
+ASYMMETRIC = Symmetries(np.empty((0, 4, 4)), (), np.empty((0, 4, 4)))
+"""Of what looks like itself in one pose alone."""
+
+
 @dataclass(frozen=True)
 class CatalogueObject:
     """One kind of object. The frame is the paper's: z points up when the object stands, x when it lies."""
@@ -110,7 +114,7 @@ class CatalogueObject:
 
     def without_symmetries(self) -> CatalogueObject:
         """The same as one sees it whose label matters."""
-        return replace(self, symmetries=Symmetries(np.empty((0, 4, 4)), (), np.empty((0, 4, 4))))
+        return replace(self, symmetries=ASYMMETRIC)
 
     def simplified(self, triangles: int) -> Mesh:
         """The mesh with at most about ``triangles`` triangles; deterministic and cached.
