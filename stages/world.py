@@ -42,13 +42,15 @@ class World(SimulatedRobot):
         seed: int = 0
         goal: str = "auto"
         """Of the suite ``tray``: a goal template by name, or ``auto`` (chosen by the seed)."""
+        strangers: int = 0
+        """Of the suite ``tray``: objects of no goal, alike to those of the goal, that come with the start and must stay."""
         calibrated: bool = False
         """Somebody has measured where the camera is, with a board."""
 
         def __post_init__(self) -> None:
             if self.seed < 0:
                 raise Refused(f"world.seed: {self.seed} is negative; choose 0, 1, 2, ...")
-            kinds.check(self.suite, self.goal, self.seed)
+            kinds.check(self.suite, self.goal, self.seed, self.strangers)
 
     @classmethod
     def prepare(cls, config: Config) -> None:
@@ -59,7 +61,9 @@ class World(SimulatedRobot):
     def __init__(self, config: Config) -> None:
         self._config, self._catalogue = config, Catalogue.shared(config.catalogue)
         robot = read_robot(config.robot)
-        suite = kinds.suite(config.suite, self._catalogue, robot, config.seed, goal=config.goal)
+        suite = kinds.suite(
+            config.suite, self._catalogue, robot, config.seed, goal=config.goal, strangers=config.strangers
+        )
         super().__init__(robot, suite, self._catalogue, config.seed, calibrated=config.calibrated)
 
     def on_arrangement(self, arrangement: Arrangement, ctx: Context) -> RobotState:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.robot.suites import world_config
 from runner import contract
 from runner.contract import Level, Message
 from stages.demonstrator import Demonstrator
@@ -96,7 +97,7 @@ class Robot:
         self._ctx = Context(np.random.default_rng(seed), verbose)
         self._metres = metres
         self._catalogue, self._robot = Catalogue.shared(BUILT_IN), read_robot(ROBOT)
-        self._world = World(World.Config(suite=suite, seed=seed))
+        self._world = World(world_config(suite, seed))
         self._builder = SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=BUILT_IN))
         self._planner = Planner(Planner.Config(catalogue=BUILT_IN))
         self._executor = Executor(Executor.Config())

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from runner.graph.graph import load_graph
 from runner.testing import run_stage
 from stages.camera import SimulatedCamera
 from stages.devices.suites import kinds
@@ -19,6 +20,7 @@ from stages.messages import Arrangement, Frame, LookRequest, Snapshot
 from stages.scene.catalogue import BUILT_IN
 from stages.world import World
 
+ROOT = Path(__file__).parents[2]
 TILE = 480, 360
 
 
@@ -28,13 +30,18 @@ def looks(suite: str, seeds: Sequence[int]) -> Iterator[tuple[int, Snapshot, Fra
     asked = [message for kind in ("goal", "start") for message in (Arrangement(kind=kind), LookRequest(purpose=kind))]
     for seed in seeds:
         told = partial(_say, f"{suite} {seed}")
-        shown = run_stage(World(World.Config(suite=suite, seed=seed)), asked, log=told)
+        shown = run_stage(World(world_config(suite, seed)), asked, log=told)
         for snapshot in shown[1::2]:
             assert isinstance(snapshot, Snapshot)
             (frame,) = run_stage(camera, [snapshot])
             assert isinstance(frame, Frame)
             yield seed, snapshot, frame
     camera.close()
+
+
+def world_config(suite: str, seed: int) -> World.Config:
+    """The world of the default graph."""
+    return load_graph(ROOT / "graph.yaml", (f"world.suite={suite}", f"world.seed={seed}")).nodes["world"].config
 
 
 def _say(name: str, text: str, level: str) -> None:

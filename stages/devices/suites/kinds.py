@@ -31,16 +31,22 @@ DRAWN: dict[str, type[Drawn]] = {
 NAMES = (TRAY, *DRAWN)
 
 
-def check(name: str, goal: str, seed: int) -> None:
-    """Raises :class:`Refused` for suites that do not exist and goals that the suite does not have."""
+def check(name: str, goal: str, seed: int, strangers: int) -> None:
+    """Raises :class:`Refused` for suites that do not exist and what the suite does not have."""
     if name not in NAMES:
         raise Refused(f"world.suite: no suite {name!r}; choose one of {', '.join(NAMES)}")
     if name == TRAY:
-        tray.goal_name(goal, seed)
+        most = len(tray.GOALS[tray.goal_name(goal, seed)])
+        if not 0 <= strangers <= most:
+            raise Refused(f"world.strangers: {strangers} is not one of 0 to {most}")
     elif goal != "auto":
         raise Refused(f"world.goal: suite {name} draws its goals; {goal!r} is a goal of suite {TRAY}")
 
 
-def suite(name: str, catalogue: Catalogue, robot: Robot, seed: int, *, goal: str = "auto") -> Suite:
-    """The world of a suite that a seed draws."""
-    return tray.Tray(catalogue, robot, seed, goal) if name == TRAY else DRAWN[name](catalogue, robot, seed)
+def suite(
+    name: str, catalogue: Catalogue, robot: Robot, seed: int, *, goal: str = "auto", strangers: int = 0
+) -> Suite:
+    """The world of a suite that a seed draws; ``goal`` and ``strangers`` are those of the suite ``tray``."""
+    if name == TRAY:
+        return tray.Tray(catalogue, robot, seed, goal, strangers)
+    return DRAWN[name](catalogue, robot, seed)

@@ -1,4 +1,4 @@
-"""The suite ``tray``: five goals written by hand, five objects on and around a tray, upright and apart."""
+"""The suite ``tray``: five goals written by hand, five objects on and around a tray, upright and apart; strangers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.devices.suites.placing import support_height, upright
-from stages.devices.suites.suite import Kind, Suite, shift
+from stages.devices.suites.suite import Kind, Rejected, Suite, graspable, shift
 from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
@@ -23,6 +23,8 @@ _NEAR, _FAR = 0.52, 0.80
 """Metres ahead between which objects stand."""
 _APART = 0.04
 """Metres between objects that are not placed together: room for a finger."""
+_EDGE = 0.08
+"""Metres from the table's edge that the middle of a stranger keeps."""
 _STACKED_SHARE = 0.3
 """Share of start scenes that contain a stack, which is not the goal's."""
 _ATTEMPTS = 2000
@@ -104,16 +106,48 @@ def object_names(goal: str) -> tuple[str, ...]:
 
 
 class Tray(Suite):
-    """One of the goals, chosen by name or by the seed; the objects apart on the table as start."""
+    """One of the goals, chosen by name or by the seed; the objects apart on the table as start, strangers among them."""
 
-    def __init__(self, catalogue: Catalogue, robot: Robot, seed: int, goal: str = "auto") -> None:
+    def __init__(self, catalogue: Catalogue, robot: Robot, seed: int, goal: str = "auto", strangers: int = 0) -> None:
         self._catalogue, self._robot, self._goal = catalogue, robot, goal_name(goal, seed)
         self.table = robot.table
-        self.names = object_names(self._goal)
+        self._strangers = look_alikes(self._goal, catalogue, np.random.default_rng([seed, 2]))[:strangers]
+        self.names = (*object_names(self._goal), *self._strangers)
 
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
-        """A scene of the goal."""
-        return (sample_goal if kind == "goal" else sample_start)(self._goal, self._catalogue, self._robot, rng)
+        """A scene of the goal; the strangers come with the start."""
+        if kind == "goal":
+            return sample_goal(self._goal, self._catalogue, self._robot, rng)
+        layout = sample_start(self._goal, self._catalogue, self._robot, rng)
+        for name in self._strangers:
+            _add_stranger(name, layout, self._catalogue, self._robot, rng)
+        return layout
+
+
+def look_alikes(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> list[str]:
+    """What the goal does not have and the hand can move: for each object of the goal, in any order, the nearest in size."""
+    left = {name: np.sort(catalogue[name].dimensions) for name in graspable(catalogue) if name not in object_names(goal)}
+    alike = []
+    for spot in rng.permutation([spot.name for spot in GOALS[goal]])[: len(left)]:
+        size = np.sort(catalogue[spot].dimensions)
+        alike.append(min(left, key=lambda name: float(np.linalg.norm(left[name] - size))))
+        del left[alike[-1]]
+    return alike
+
+
+def _add_stranger(name: str, layout: Layout, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> None:
+    """Puts it anywhere on the table, for nobody has to reach it, where it keeps its distance and hides nothing too much.
+
+    Raises:
+        Rejected: there is no such place.
+    """
+    entry, size = catalogue[name], np.array(robot.table.size) / 2 - _EDGE
+    for _ in range(_ATTEMPTS):
+        x, y = robot.table.center + rng.uniform(-size, size)
+        layout[name] = upright(entry, x, y, rng.uniform(-np.pi, np.pi), robot.table.height)
+        if _is_apart(name, layout, catalogue) and _is_seen(layout, catalogue, robot):
+            return
+    raise Rejected(f"no room for {name}")
 
 
 def sample_goal(goal: str, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> Layout:
@@ -171,8 +205,11 @@ def _fits(name: str, layout: Layout, goal: str, catalogue: Catalogue, robot: Rob
         fits = _can_be_filled(T, goal, robot)
     else:
         fits = _reachable(T, robot) and is_inside_image(robot, image_rectangle(robot, entry, T))
-    if not fits:
-        return False
+    return fits and _is_apart(name, layout, catalogue)
+
+
+def _is_apart(name: str, layout: Layout, catalogue: Catalogue) -> bool:
+    """The object keeps its distance from all others."""
     return all(_gap(name, other, layout, catalogue) >= _APART for other in layout if other != name)
 
 
@@ -244,7 +281,12 @@ def _is_good(
     apart = all(
         frozenset(pair) in together or _gap(*pair, layout, catalogue) >= _APART for pair in combinations(standing, 2)
     )
-    return reach and apart and is_seen(robot, [(catalogue[name], T) for name, T in layout.items() if name != TRAY])
+    return reach and apart and _is_seen(layout, catalogue, robot)
+
+
+def _is_seen(layout: Layout, catalogue: Catalogue, robot: Robot) -> bool:
+    """Everything but the tray in view."""
+    return is_seen(robot, [(catalogue[name], T) for name, T in layout.items() if name != TRAY])
 
 
 def _reachable(T: Floats, robot: Robot) -> bool:
