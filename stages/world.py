@@ -43,7 +43,7 @@ class World(SimulatedRobot):
         goal: str = "auto"
         """Of the suite ``tray``: a goal template by name, or ``auto`` (chosen by the seed)."""
         strangers: int = 0
-        """Of the suite ``tray``: objects of no goal, alike to those of the goal, that come with the start and must stay."""
+        """Of the suite ``tray``: objects that look like those of the goal, come with the start and must stay."""
         calibrated: bool = False
         """Somebody has measured where the camera is, with a board."""
 

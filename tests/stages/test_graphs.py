@@ -1,5 +1,7 @@
 """The graphs that come with the package: settings that hold for all of their stages."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,12 @@ def test_a_catalogue_is_beside_the_graph_in_every_stage(
     graph = load_graph(home / path.name, _needed(path))
     found = {name: node.config.catalogue for name, node in graph.nodes.items() if hasattr(node.config, "catalogue")}
     assert set(found.values()) == {home / "ours" / "objects.yaml"}
+
+
+def test_who_only_reads_a_graph_does_not_wait_for_torch() -> None:
+    code = "import sys; from tests.stages import test_graphs as t; [t.load_graph(g, t._needed(g)) for g in t.GRAPHS]"
+    command = (sys.executable, "-c", f"{code}; assert 'torch' not in sys.modules")
+    subprocess.run(command, cwd=ROOT, check=True)
 
 
 def _needed(path: Path) -> tuple[str, ...]:

@@ -43,9 +43,7 @@ def check(name: str, goal: str, seed: int, strangers: int) -> None:
         raise Refused(f"world.goal: suite {name} draws its goals; {goal!r} is a goal of suite {TRAY}")
 
 
-def suite(
-    name: str, catalogue: Catalogue, robot: Robot, seed: int, *, goal: str = "auto", strangers: int = 0
-) -> Suite:
+def suite(name: str, catalogue: Catalogue, robot: Robot, seed: int, *, goal: str = "auto", strangers: int = 0) -> Suite:
     """The world of a suite that a seed draws; ``goal`` and ``strangers`` are those of the suite ``tray``."""
     if name == TRAY:
         return tray.Tray(catalogue, robot, seed, goal, strangers)

@@ -106,7 +106,7 @@ def object_names(goal: str) -> tuple[str, ...]:
 
 
 class Tray(Suite):
-    """One of the goals, chosen by name or by the seed; the objects apart on the table as start, strangers among them."""
+    """One of the goals, chosen by name or by the seed; as start the objects apart on the table, among strangers."""
 
     def __init__(self, catalogue: Catalogue, robot: Robot, seed: int, goal: str = "auto", strangers: int = 0) -> None:
         self._catalogue, self._robot, self._goal = catalogue, robot, goal_name(goal, seed)
@@ -125,8 +125,10 @@ class Tray(Suite):
 
 
 def look_alikes(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> list[str]:
-    """What the goal does not have and the hand can move: for each object of the goal, in any order, the nearest in size."""
-    left = {name: np.sort(catalogue[name].dimensions) for name in graspable(catalogue) if name not in object_names(goal)}
+    """For each object of the goal, in any order, the nearest in size that is not in the goal and the hand can move."""
+    left = {
+        name: np.sort(catalogue[name].dimensions) for name in graspable(catalogue) if name not in object_names(goal)
+    }
     alike = []
     for spot in rng.permutation([spot.name for spot in GOALS[goal]])[: len(left)]:
         size = np.sort(catalogue[spot].dimensions)
@@ -136,7 +138,7 @@ def look_alikes(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> li
 
 
 def _add_stranger(name: str, layout: Layout, catalogue: Catalogue, robot: Robot, rng: np.random.Generator) -> None:
-    """Puts it anywhere on the table, for nobody has to reach it, where it keeps its distance and hides nothing too much.
+    """Puts it where it keeps its distance and hides nothing too much; nobody has to reach it.
 
     Raises:
         Rejected: there is no such place.

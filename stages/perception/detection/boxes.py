@@ -1,13 +1,11 @@
-"""Arithmetic on axis-aligned image boxes: overlap, suppression, offsets, average precision."""
+"""Arithmetic on axis-aligned image boxes: overlap, suppression, average precision."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from stages.geometry.arrays import Floats
 
@@ -45,22 +43,6 @@ def survivors(
             yield int(i)
             gone = intersection_over_union(boxes[i : i + 1], boxes)[0] > overlap
             alive &= ~gone if labels is None else ~(gone & (labels == labels[i]))
-
-
-def encode_offsets(anchors: Tensor, boxes: Tensor) -> Tensor:
-    """Shift and log scale that take each anchor to its box (R-CNN, Girshick et al. 2014, appendix C); N x 4."""
-    size = anchors[:, 2:] - anchors[:, :2]
-    shift = (boxes[:, :2] + boxes[:, 2:] - anchors[:, :2] - anchors[:, 2:]) / 2 / size
-    scale = torch.log((boxes[:, 2:] - boxes[:, :2]) / size)
-    return torch.cat([shift, scale], dim=1)
-
-
-def apply_offsets(anchors: Tensor, offsets: Tensor) -> Tensor:
-    """The inverse of :func:`encode_offsets`; scales are limited to a factor of 4."""
-    size = anchors[:, 2:] - anchors[:, :2]
-    centre = (anchors[:, :2] + anchors[:, 2:]) / 2 + offsets[:, :2] * size
-    half = size * torch.exp(offsets[:, 2:].clamp(-1.386, 1.386)) / 2
-    return torch.cat([centre - half, centre + half], dim=1)
 
 
 def average_precision(scores: Floats, correct: NDArray[np.bool_], positives: int) -> float:

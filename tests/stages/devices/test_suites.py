@@ -164,6 +164,8 @@ def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:
         World.Config(suite="neat")
     with pytest.raises(Refused, match=r"world\.goal: suite wild draws its goals"):
         World.Config(suite="wild", goal="tea")
+    with pytest.raises(Refused, match=r"world\.strangers: 6 is not one of 0 to 5"):
+        World.Config(strangers=6)
     assert set(kinds.DRAWN) == set(kinds.NAMES) - {"tray"}
 
 

@@ -7,7 +7,7 @@ from runner.contract import Refused
 from stages.devices.simulation import Simulation
 from stages.devices.suites import tray
 from stages.devices.suites.placing import moved, support_height
-from stages.devices.suites.tray import GOALS, sample_goal, sample_start
+from stages.devices.suites.tray import GOALS, Tray, look_alikes, sample_goal, sample_start
 from stages.devices.tabletop import Layout
 from stages.robots import Robot
 from stages.scene.catalogue import Catalogue
@@ -50,6 +50,28 @@ def test_start_and_goal_differ() -> None:
     goal = sample_goal("tea", catalogue(), ROBOT, np.random.default_rng([3, 0]))
     start = sample_start("tea", catalogue(), ROBOT, np.random.default_rng([3, 1]))
     assert all(np.linalg.norm(goal[name][:2, 3] - start[name][:2, 3]) > 0.01 for name in goal)
+
+
+@pytest.mark.parametrize("goal", GOALS)
+def test_strangers_come_with_the_start_stand_and_leave_the_others_where_the_seed_has_them(goal: str) -> None:
+    for seed in range(3):
+        world, plain = (Tray(catalogue(), ROBOT, seed, goal, strangers) for strangers in (3, 0))
+        shown = world.sample("goal", np.random.default_rng(seed))
+        start, without = (suite.sample("start", np.random.default_rng(seed)) for suite in (world, plain))
+        strangers = set(world.names) - set(plain.names)
+        assert len(strangers) == 3 and set(start) - set(without) == strangers and not strangers & set(shown)
+        for name, T in without.items():
+            np.testing.assert_array_equal(T, start[name])
+        simulation = Simulation(catalogue(), ROBOT, world.names, TABLE)
+        simulation.arrange(start)
+        for name, settled in simulation.layout().items():
+            assert np.linalg.norm(settled[:3, 3] - start[name][:3, 3]) < 0.003, (seed, name)
+
+
+def test_strangers_are_what_looks_most_like_an_object_of_the_goal() -> None:
+    found = look_alikes("tea", catalogue(), np.random.default_rng(0))
+    assert len(found) == 5 and {"mug", "sauce_bottle"} < set(found)
+    assert not set(found) & set(tray.object_names("tea"))
 
 
 def test_an_unknown_goal_is_refused_with_the_choices() -> None:

@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from runner.contract import Refused
-from stages.perception.detection.boxes import apply_offsets, suppress
+from stages.perception.detection.boxes import suppress
+from stages.perception.detection.trained.offsets import apply_offsets
 
 WIDTH, HEIGHT = 320, 240
 """Images are scaled to fit this size; boxes inside the network are in its pixels."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from stages.perception.detection.boxes import encode_offsets, intersection_over_union
+from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.trained.network import (
     ANCHOR_SIZES,
     HEIGHT,
@@ -26,6 +26,7 @@ from stages.perception.detection.trained.network import (
     anchor_boxes,
     normalised,
 )
+from stages.perception.detection.trained.offsets import encode_offsets
 from stages.perception.detection.trained.training_images import Example, load_examples
 
 REGIONS = 48

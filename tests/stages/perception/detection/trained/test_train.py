@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from stages.perception.detection.boxes import apply_offsets, intersection_over_union
+from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.trained.network import HEIGHT, WIDTH, DetectionNetwork, anchor_boxes
+from stages.perception.detection.trained.offsets import apply_offsets
 from stages.perception.detection.trained.train import (
     REGIONS,
     anchor_targets,
