@@ -30,16 +30,19 @@ def distinct(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Fl
 
 
 def without_doubles(objects: Sequence[ObjectPose]) -> tuple[ObjectPose, ...]:
-    """The objects of a scene, each once."""
-    labels, boxes = [item.label for item in objects], [item.box for item in objects]
-    return tuple(objects[i] for i in distinct(labels, boxes, [_place(item) for item in objects]))
+    """The objects of a scene, each once: two boxes apart may show the two ends of one, with something before it."""
+    kept: list[ObjectPose] = []
+    for item in objects:
+        if not any(_is_same(other, item) for other in kept):
+            kept.append(item)
+    return tuple(kept)
 
 
 def is_same_scene(one: Sequence[ObjectPose], other: Sequence[ObjectPose]) -> bool:
     """Whether two scenes have the same objects in the same places, whichever candidates they came from."""
     left = list(other)
     for item in one:
-        found = next((o for o in left if o.label == item.label and _together(_place(o), _place(item))), None)
+        found = next((o for o in left if _is_same(o, item)), None)
         if found is None:
             return False
         left.remove(found)
@@ -52,8 +55,8 @@ def shared(a: Floats, b: Floats) -> float:
     return float(inside / max(min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])), 1e-9))
 
 
-def _place(item: ObjectPose) -> Floats:
-    return item.T_camera_object[:3, 3]
+def _is_same(one: ObjectPose, other: ObjectPose) -> bool:
+    return one.label == other.label and _together(one.T_camera_object[:3, 3], other.T_camera_object[:3, 3])
 
 
 def _together(a: Floats, b: Floats) -> bool:
