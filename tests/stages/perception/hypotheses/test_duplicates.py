@@ -37,7 +37,7 @@ def test_a_scene_has_each_object_once() -> None:
 
 
 def test_two_boxes_that_do_not_touch_may_show_one_object() -> None:
-    lower = BOX + [0, 130, 0, 130]
+    lower = BOX + np.array([0.0, 130.0, 0.0, 130.0])
     assert len(without_doubles([item("cup", HERE), item("cup", NEAR, lower)])) == 1
 
 
