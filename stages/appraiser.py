@@ -14,7 +14,7 @@ from runner.contract import Context, Stage
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose
 from stages.messages import Observation
-from stages.messages.digest import Candidate, Sighting
+from stages.messages.digest import Candidate, LoneEstimate
 from stages.perception.refinement.colour import ColourSettings, likeness, load
 from stages.perception.rendering.paint import Paint
 from stages.perception.rendering.rasteriser import View
@@ -73,7 +73,9 @@ class Appraiser(Stage):
         self._appraisal, self._aligned, self._faintness = appraisal, aligned, faintness
         self._likenesses = Likenesses(Catalogue.shared(config.catalogue))
 
-    def on_sightings(self, sightings: list[Sighting], observation: Observation, ctx: Context) -> Iterator[Sighting]:
+    def on_sightings(
+        self, sightings: list[LoneEstimate], observation: Observation, ctx: Context
+    ) -> Iterator[LoneEstimate]:
         """The same candidates, as sure as what their objects show allows."""
         found = [(s.candidate, s.start, s.glimpse) for s in sightings if s.candidate and s.start and s.glimpse]
         if not found:  # the paper's plain form takes no looks

@@ -14,7 +14,7 @@ from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Candidates, Frame
-from stages.perception.hypotheses.duplicates import distinct
+from stages.perception.hypotheses.duplicates import unrepeated
 from stages.scene.catalogue import Catalogue
 
 _FAR = np.float32(100.0)
@@ -85,7 +85,7 @@ class Detector(Stage):
         found = self._detect(self._network, frame.rgb, threshold=config.floor, keep=config.max_boxes, labels=columns)
         sure = int((found.scores >= config.threshold).sum())
         # A second box of one object, or one of its part, is no other object.
-        objects = len(distinct([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
+        objects = len(unrepeated([labels[i] for i in found.confidences[:sure].argmax(1)], [*found.boxes]))
         kept = slice(sure if config.expected != "auto" and objects >= config.expected else None)
         message = _candidates(found.boxes[kept], found.confidences[kept], labels, others=_OTHERS)
         ctx.log(f"{frame.name}: " + (_summary(message) or "no object found"))

@@ -30,7 +30,7 @@ from stages.messages import (
     SceneEstimate,
     SceneGraph,
 )
-from stages.messages.digest import Contender, Prospect, Sighting
+from stages.messages.digest import Contender, LoneCandidate, LoneEstimate
 from stages.messages.scene import UnknownRegion
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
@@ -125,7 +125,7 @@ def estimate_scene(
 class Filters(Protocol):
     """Particle filters that answer every part of a look, in order: in this process or in several."""
 
-    def look(self, prospects: Sequence[Prospect], observation: Observation) -> list[Sighting]:
+    def look(self, prospects: Sequence[LoneCandidate], observation: Observation) -> list[LoneEstimate]:
         """What the look at each candidate alone found."""
         ...
 
@@ -167,10 +167,10 @@ class SceneEstimator:
         yield ranked
         yield self.refiner.on_scene_estimate(ranked, observation, ctx)
 
-    def _begun(self, frame: Frame, candidates: Candidates, ctx: Context) -> tuple[Observation, list[Prospect]]:
+    def _begun(self, frame: Frame, candidates: Candidates, ctx: Context) -> tuple[Observation, list[LoneCandidate]]:
         observation, *rest = self.hypotheses.on_candidates(frame, candidates, ctx)
         assert isinstance(observation, Observation)
-        return observation, [part for part in rest if isinstance(part, Prospect)]
+        return observation, [part for part in rest if isinstance(part, LoneCandidate)]
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class FiltersHere:
 
     stage: ParticleFilter
 
-    def look(self, prospects: Sequence[Prospect], observation: Observation) -> list[Sighting]:
+    def look(self, prospects: Sequence[LoneCandidate], observation: Observation) -> list[LoneEstimate]:
         """One look after the other."""
         return [self.stage.on_prospect(prospect, observation, Quiet()) for prospect in prospects]
 

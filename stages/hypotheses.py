@@ -11,7 +11,7 @@ import numpy as np
 
 from runner.contract import Context, Refused, Stage
 from stages.messages import Candidate, Candidates, Frame, Hypothesis, ObjectPose, Observation, Posterior
-from stages.messages.digest import Contender, Glimpse, Offer, Placed, Prospect, Search, Sighting, Start
+from stages.messages.digest import Contender, DepthPatch, LoneCandidate, LoneEstimate, LonePose, Offer, Placed, Search
 from stages.perception.hypotheses.combinations import (
     additions_first,
     cheapest,
@@ -21,7 +21,7 @@ from stages.perception.hypotheses.combinations import (
     ordered,
 )
 from stages.perception.hypotheses.composition import FirstLook, charge
-from stages.perception.hypotheses.duplicates import distinct
+from stages.perception.hypotheses.duplicates import unrepeated
 from stages.perception.hypotheses.revisions import (
     Revision,
     is_better,
@@ -39,8 +39,8 @@ class _Found:
     """A candidate and what the look at it alone found."""
 
     candidate: Candidate
-    start: Start
-    glimpse: Glimpse
+    start: LonePose
+    glimpse: DepthPatch
     share: float
 
     @property
@@ -91,15 +91,17 @@ class Hypotheses(Stage):
     def __init__(self, config: Config) -> None:
         self.config = config
 
-    def on_candidates(self, frame: Frame, candidates: Candidates, ctx: Context) -> Iterator[Observation | Prospect]:
+    def on_candidates(
+        self, frame: Frame, candidates: Candidates, ctx: Context
+    ) -> Iterator[Observation | LoneCandidate]:
         """One observation, then every candidate by itself, the most confident first."""
         number = self._n_objects(frame)
         yield preprocess(frame, candidates.candidates, ctx.rng, max_height=self.config.max_height)
         prospects = ordered(candidates.candidates) or [None]
         for index, candidate in enumerate(prospects):
-            yield Prospect(index=index, count=len(prospects), candidate=candidate, n_objects=number)
+            yield LoneCandidate(index=index, count=len(prospects), candidate=candidate, n_objects=number)
 
-    def on_sightings(self, sightings: list[Sighting], ctx: Context) -> Iterator[Hypothesis]:
+    def on_sightings(self, sightings: list[LoneEstimate], ctx: Context) -> Iterator[Hypothesis]:
         """h hypotheses, the cheapest (in the paper's plain form the most confident) combination first."""
         number = sightings[0].n_objects
         found = [_Found(s.candidate, s.start, s.glimpse, s.share) for s in sightings if s.candidate is not None
@@ -221,7 +223,7 @@ def _revised(best: Posterior, revised: Sequence[Revision], search: Search) -> It
             count=len(revised),
             candidates=(*(placed[i].candidate for i in each.kept), *(offers[k].candidate for k in each.new)),
             left_out=best.left_out,
-            starts=tuple(Start(T_camera_object=placed[i].T_camera_object, trace=best.traces[i]) for i in each.kept),
+            starts=tuple(LonePose(T_camera_object=placed[i].T_camera_object, trace=best.traces[i]) for i in each.kept),
             incumbent=placed,
             charged=sum(charges),
             incumbent_charged=sum(best.charges),
@@ -246,7 +248,7 @@ def _distinct(found: list[_Found], ctx: Context) -> list[_Found]:
     """Those that show no object that a more confident one shows, the most confident first."""
     found = sorted(found, key=lambda each: -each.candidate.confidence)
     labels, boxes = [each.candidate.label for each in found], [each.candidate.box for each in found]
-    kept = distinct(labels, boxes, [each.start.T_camera_object[:3, 3] for each in found])
+    kept = unrepeated(labels, boxes, [each.start.T_camera_object[:3, 3] for each in found])
     if len(kept) < len(found):
         ctx.log(f"{len(found) - len(kept)} of {len(found)} candidates show an object once more: left out")
     return [found[i] for i in kept]

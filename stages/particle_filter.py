@@ -14,7 +14,7 @@ from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
-from stages.messages.digest import ParticleTrace, Prospect, Sighting, Start
+from stages.messages.digest import LoneCandidate, LoneEstimate, LonePose, ParticleTrace
 from stages.perception.cuda.device import DEVICES, chosen_device
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.particle_filter import Track
@@ -82,10 +82,10 @@ class ParticleFilter(Stage):
         self._suggestions = Suggestions(catalogue)
         self._seen: tuple[Observation, ObservedScene] | None = None
 
-    def on_prospect(self, prospect: Prospect, view: Observation, ctx: Context) -> Sighting:
+    def on_prospect(self, prospect: LoneCandidate, view: Observation, ctx: Context) -> LoneEstimate:
         """A look at one candidate alone, where the form takes one."""
         candidate = prospect.candidate
-        nothing = Sighting(
+        nothing = LoneEstimate(
             index=prospect.index, count=prospect.count, n_objects=prospect.n_objects, candidate=candidate
         )
         if candidate is None or not self._filter.looks_first:
@@ -93,7 +93,7 @@ class ParticleFilter(Stage):
         scene, suspect = self._scene(view), _suspect(candidate)
         track = self._filter.look(scene, suspect, among=prospect.count)
         unknown = prospect.n_objects is None
-        start = Start(T_camera_object=_pose(track), trace=_trace(track))
+        start = LonePose(T_camera_object=_pose(track), trace=_trace(track))
         if unknown:
             start = self._start(scene, suspect, track)
         return msgspec.structs.replace(
@@ -153,9 +153,9 @@ class ParticleFilter(Stage):
             for k, (candidate, track, share) in enumerate(new, first)
         )
 
-    def _start(self, scene: ObservedScene, suspect: Suspect, track: Track) -> Start:
+    def _start(self, scene: ObservedScene, suspect: Suspect, track: Track) -> LonePose:
         rise, claim, explained = self._filter.worth(scene, suspect, track)
-        return Start(T_camera_object=_pose(track), trace=_trace(track), rise=rise, claim=claim, explained=explained)
+        return LonePose(T_camera_object=_pose(track), trace=_trace(track), rise=rise, claim=claim, explained=explained)
 
     def _reached(self, scene: ObservedScene, hypothesis: Hypothesis) -> float:
         """What a scene of the hypothesis may cost and still weigh as much as the known one."""
@@ -193,6 +193,6 @@ def _trace(track: Track) -> ParticleTrace:
     return ParticleTrace(iterations=track.iterations, costs=np.array(track.costs, float), positions=track.positions)
 
 
-def _track(start: Start) -> Track:
+def _track(start: LonePose) -> Track:
     trace = start.trace
     return Track(start.T_camera_object[:3].copy(), np.inf, trace.iterations, tuple(trace.costs), trace.positions)

@@ -17,7 +17,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.scene.catalogue import Catalogue
-from stages.scene.episode import Episode, Look, markdown, plain, title
+from stages.scene.episode import Episode, ReportedLook, markdown, plain, title
 from stages.scene.scoring import errors
 from stages.scene.text import certainty
 from stages.scene.truth import Truth
@@ -43,7 +43,7 @@ class Report(Stage):
     def __init__(self, config: Config) -> None:
         self._catalogue = Catalogue.shared(config.catalogue)
         self._truth = Truth(self._catalogue)
-        self._looks: list[tuple[int, Look, Snapshot]] = []
+        self._looks: list[tuple[int, ReportedLook, Snapshot]] = []
         self._plans: list[Plan] = []
         self._outcomes: dict[int, Outcome] = {}
         self._restarts: list[str] = []
@@ -59,7 +59,7 @@ class Report(Stage):
         ctx: Context,
     ) -> Finished | None:
         """Scores one look against the truth of the instant it was taken."""
-        look = Look(
+        look = ReportedLook(
             purpose=snapshot.purpose,
             boxes=len(candidates.candidates),
             hypotheses=len(scene_estimate.log_weights),

@@ -14,12 +14,12 @@ from runner.graph.graph import Graph
 from runner.process.step import step_seed
 from stages.estimate import FiltersHere, Quiet, SceneEstimator
 from stages.messages import Hypothesis, Observation, Posterior, SceneEstimate
-from stages.messages.digest import Prospect, Sighting
+from stages.messages.digest import LoneCandidate, LoneEstimate
 from stages.particle_filter import ParticleFilter
 
 STAGES = ("hypotheses", "particle_filter", "ranker", "refiner")
 """Of a graph: those between the candidates and the final scene."""
-Answer = TypeVar("Answer", Sighting, Posterior)
+Answer = TypeVar("Answer", LoneEstimate, Posterior)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Part:
     """What one particle filter is asked."""
 
     handler: Literal["on_prospect", "on_hypothesis"]
-    message: Prospect | Hypothesis
+    message: LoneCandidate | Hypothesis
     observation: Observation
 
 
@@ -68,7 +68,7 @@ class PooledFilters:
     cpu_seconds: float = field(default=0.0, init=False)
     """What they have computed so far."""
 
-    def look(self, prospects: Sequence[Prospect], observation: Observation) -> list[Sighting]:
+    def look(self, prospects: Sequence[LoneCandidate], observation: Observation) -> list[LoneEstimate]:
         """All looks at once."""
         return self._answers([Part("on_prospect", prospect, observation) for prospect in prospects])
 

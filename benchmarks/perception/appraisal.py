@@ -28,7 +28,7 @@ from stages.estimate import Quiet
 from stages.geometry.arrays import Floats
 from stages.hypotheses import Hypotheses
 from stages.messages import Observation
-from stages.messages.digest import Prospect, Sighting
+from stages.messages.digest import LoneCandidate, LoneEstimate
 from stages.particle_filter import ParticleFilter
 from stages.perception.detection.alignment import aligned
 from stages.perception.detection.appraisal import (
@@ -125,13 +125,15 @@ def cases(dataset: Path, without: Sequence[str], objects: Objects, camera: int |
 
 def _looked(
     image: Image, detector: ModelDetector, filters: ParticleFilter
-) -> tuple[Observation, list[Sighting]]:  # fmt: skip
+) -> tuple[Observation, list[LoneEstimate]]:  # fmt: skip
     cause = f"camera.frame#{image.frame.index}"
     candidates = detector.on_frame(image.frame, Quiet(step_seed(0, "detector", cause)))
     search = Hypotheses(Hypotheses.Config(n_objects="auto"))
     observation, *rest = search.on_candidates(image.frame, candidates, Quiet(step_seed(0, "hypotheses", cause)))
     assert isinstance(observation, Observation)
-    return observation, [filters.on_prospect(part, observation, Quiet()) for part in rest if isinstance(part, Prospect)]
+    return observation, [
+        filters.on_prospect(part, observation, Quiet()) for part in rest if isinstance(part, LoneCandidate)
+    ]
 
 
 def _apart(T: Floats, truth: Truth, middle: Floats, farther: float) -> float:

@@ -25,10 +25,10 @@ from benchmarks.perception.kernel import (
 )
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Hypothesis, Observation, Posterior
-from stages.messages.digest import Prospect
+from stages.messages.digest import LoneCandidate
 from stages.particle_filter import ParticleFilter
 from stages.perception.cuda.device import cuda_obstacle
-from stages.perception.filter.evolution import Population, Step
+from stages.perception.filter.iterations import IterationSettings, Population
 from stages.perception.filter.likelihood import ObjectLikelihood
 from stages.perception.filter.proposals import Guess, Proposals
 from stages.perception.filter.settings import FilterSettings
@@ -44,9 +44,9 @@ def exchanged(
     likelihood: ObjectLikelihood, poses: Floats, *, iterations: int = ITERATIONS, launch: Any = None
 ) -> float:
     """Milliseconds of costs where poses come from the host and costs go back."""
-    from stages.perception.cuda.batch import Batch, Look
+    from stages.perception.cuda.batch import Batch, CostInputs
 
-    batch = Batch([likelihood.shape], [Look.of(likelihood)], launch)
+    batch = Batch([likelihood.shape], [CostInputs.of(likelihood)], launch)
     return _milliseconds(lambda n: [batch.changes(poses) for _ in range(n)], iterations)
 
 
@@ -56,20 +56,20 @@ def resident(
 ) -> float:  # fmt: skip
     """Milliseconds per iteration of populations that stay on the device: costs, weights, resampling, transition,
     polish of as many particles as the filter's."""
-    from stages.perception.cuda.evolution import CudaEvolution
+    from stages.perception.cuda.iterations import CudaIterations
 
     settings = replace(FilterSettings(particles=len(poses)), schedule=None)
     proposals, T_camera_table = Proposals(item, 6), np.eye(4)
     guess = Guess(poses[:, :, 3].astype(float), T_camera_table)
     flipped, few = int(settings.flips * len(poses)), int(settings.polished * len(poses))
     # The spread stays what it is, so that every iteration is as much work as the first.
-    step = Step(len(poses), 0.01, 0.2, flipped, int(settings.renewed * len(poses)), flipped + few)
+    step = IterationSettings(len(poses), 0.01, 0.2, flipped, int(settings.renewed * len(poses)), flipped + few)
     populations = [
         Population(poses, likelihood, proposals.directions(T_camera_table), proposals, guess, np.random.default_rng(h))
         for h in range(copies)
     ]
-    evolution = CudaEvolution(populations, [step] * (iterations + 3), settings, launch=launch)
-    return _milliseconds(evolution.iterate, iterations)
+    going = CudaIterations(populations, [step] * (iterations + 3), settings, launch=launch)
+    return _milliseconds(going.iterate, iterations)
 
 
 def _milliseconds(run: Any, iterations: int) -> float:
@@ -86,9 +86,9 @@ def _milliseconds(run: Any, iterations: int) -> float:
 
 def deviation(likelihood: ObjectLikelihood, poses: Floats) -> float:
     """The greatest difference between the GPU's costs and the CPU's, as a share of the cost without the object."""
-    from stages.perception.cuda.batch import Batch, Look
+    from stages.perception.cuda.batch import Batch, CostInputs
 
-    changes = Batch([likelihood.shape], [Look.of(likelihood)]).changes(poses)
+    changes = Batch([likelihood.shape], [CostInputs.of(likelihood)]).changes(poses)
     return float(abs(likelihood.base + changes - likelihood.costs(poses)).max() / likelihood.base)
 
 
@@ -121,7 +121,7 @@ def stage_seconds(stage: ParticleFilter, seen: Table) -> tuple[float, Posterior]
     """What the stage takes for the scene: a look at each candidate, then the hypothesis that has them all."""
     quiet, count, start = cast(Any, _Quiet()), len(seen.candidates), time.perf_counter()
     prospects = [
-        Prospect(index=i, count=count, n_objects=count, candidate=each) for i, each in enumerate(seen.candidates)
+        LoneCandidate(index=i, count=count, n_objects=count, candidate=each) for i, each in enumerate(seen.candidates)
     ]
     looks = [stage.on_prospect(prospect, seen.observation, quiet).start for prospect in prospects]
     starts = tuple(look for look in looks if look is not None)

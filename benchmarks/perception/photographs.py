@@ -29,7 +29,7 @@ from stages.devices.bop_results import Result
 from stages.estimate import FiltersHere, Quiet, SceneEstimator
 from stages.hypotheses import Hypotheses
 from stages.messages import Candidates, Posterior, SceneEstimate
-from stages.messages.digest import Sighting
+from stages.messages.digest import LoneEstimate
 from stages.particle_filter import ParticleFilter
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.views import Views
@@ -86,7 +86,7 @@ def lost(one: Score, seen: Seen, name: str) -> str:
     """The stage that lost an object which is not within 2 cm and 15 degrees, in words."""
     if one.result is not None and one.metres < 2 * _NEAR:
         return f"its pose is wrong: {described(one)}"
-    looks = [m for m in seen.messages if isinstance(m, Sighting) and m.candidate and m.candidate.label == name]
+    looks = [m for m in seen.messages if isinstance(m, LoneEstimate) and m.candidate and m.candidate.label == name]
     near = [look for look in looks if look.start and _apart(look.start.T_camera_object, one.truth) < _NEAR]
     if not near:
         boxes = np.array([c.box for c in seen.candidates.candidates if c.label == name]).reshape(-1, 4)
@@ -104,7 +104,7 @@ def _apart(T: np.ndarray, truth: Truth) -> float:
     return float(np.linalg.norm(T[:3, 3] - truth.T_camera_object[:3, 3]))
 
 
-def _judged(look: Sighting) -> str:
+def _judged(look: LoneEstimate) -> str:
     assert look.candidate and look.start
     likely, explained, asked = look.candidate.confidence, look.start.explained, max(look.share, 0.0)
     return f"likely {likely:.2f}, explains {explained:.2f}, asked for {asked:.2f}"

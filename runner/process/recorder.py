@@ -24,7 +24,7 @@ from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, is_orphan, print_where_it_crashes
 from runner.process.health import Heartbeat
 from runner.process.redelivery import Redelivery
-from runner.recording.recording import Verdict
+from runner.recording.recording import Completeness
 from runner.recording.writer import Manifest, RecordingWriter
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
@@ -87,7 +87,7 @@ class Recorder:
         """By the first part of a key."""
         self._heartbeat = Heartbeat(own, self._bus, lambda: {**self._writer.vitals(), "refused": self._refusals.count})
 
-    def run(self) -> Verdict:
+    def run(self) -> Completeness:
         """Records until it is stopped."""
         self._hear("x/*", "knows/**", "l/*", "s/*", f"m/{SUPERVISOR}/*")
         self._bus.watch(self._on_presence, self._refusals.refuse)

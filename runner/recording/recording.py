@@ -64,7 +64,7 @@ class Located:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Completeness:
     """Whether everything that was sent is in the recording."""
 
     complete: bool
@@ -178,13 +178,13 @@ class Recording:
         return _decoded(self.run.get(name, ""), type(default)) or default
 
     @cached_property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Completeness:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
         counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason = self._breakage or written.get("reason", "")
         if self._steps_only:
-            return Verdict(False, (), reason, counts)
+            return Completeness(False, (), reason, counts)
         proof, found = self._prove(), ""
         missing = proof.missing()
         if self._says_ends:
@@ -192,7 +192,7 @@ class Recording:
             found = in_short(chain(proof.problems(counts), self._misplaced))
         complete = written.get("verdict") == "COMPLETE" and not (self._breakage or found or missing)
         reasons = (reason, "" if found in reason else found)
-        return Verdict(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
+        return Completeness(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
 
     def records(self) -> Iterator[Entry | Metadata]:
         """Everything in the file once more, as it was written; what cannot be read is left out."""

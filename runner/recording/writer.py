@@ -40,7 +40,7 @@ from runner.recording.recording import (
     RUN,
     STEPS_ONLY,
     VERDICT,
-    Verdict,
+    Completeness,
     payload_kind,
 )
 
@@ -203,7 +203,7 @@ class RecordingWriter:
         """Has the verdict name a reason why not everything may be there."""
         self._problems.append(problem)
 
-    def close(self) -> Verdict:
+    def close(self) -> Completeness:
         """Writes what is waiting, the verdict and the end of the file."""
         self._closing.set()
         self._thread.join()
@@ -302,15 +302,15 @@ class RecordingWriter:
         self._prove(self._file.tell())
         self._whole = True
 
-    def _verdict(self) -> Verdict:
+    def _verdict(self) -> Completeness:
         if self._steps_only:
-            return Verdict(False, (), "; ".join([STEPS_ONLY, *self._problems]))
+            return Completeness(False, (), "; ".join([STEPS_ONLY, *self._problems]))
         overflow = f"{self._overflowed} payloads dropped: the disk was too slow" if self._overflowed else ""
         unread = in_short(f"read back: {damage}" for damage in self._container.damage)
         with self._proving:
             missing, counts, found = self._proof.missing(), self._proof.counts, in_short(self._proof.problems())
         reason = "; ".join(filter(None, (*self._problems, overflow, unread, found)))
-        return Verdict(not missing and not reason, missing, reason, counts)
+        return Completeness(not missing and not reason, missing, reason, counts)
 
     # ------------------------------------------------------------------------------------ what is not recorded
 

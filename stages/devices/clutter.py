@@ -90,7 +90,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ClutterImage:
     """One image of a pile, and the truth."""
 
     labels: tuple[str, ...]
@@ -126,7 +126,7 @@ class Clutter:
                 used[label] += 1
         return scenes
 
-    def scene(self, index: int, labels: Sequence[str]) -> Scene:
+    def scene(self, index: int, labels: Sequence[str]) -> ClutterImage:
         """Drops the objects until a view shows enough of each, and takes of its views the one that hides most."""
         rng = np.random.default_rng([self._seed, 1, index])
         while True:
@@ -137,7 +137,7 @@ class Clutter:
             if views:
                 camera, seen = min(views, key=lambda view: np.mean([each.visible for each in view[1]]))
                 rgb, depth = self._image(labels, poses, camera, rng)
-                return Scene(tuple(labels), tuple(poses), camera, rgb, depth, tuple(seen))
+                return ClutterImage(tuple(labels), tuple(poses), camera, rgb, depth, tuple(seen))
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -335,7 +335,7 @@ def _flat(T: Floats) -> list[float]:
     return scaled.reshape(-1).tolist()
 
 
-def _write_scene(folder: Path, scene: Scene, numbers: Sequence[int]) -> None:
+def _write_scene(folder: Path, scene: ClutterImage, numbers: Sequence[int]) -> None:
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     Image.fromarray(scene.rgb).save(folder / "rgb" / "000000.png")

@@ -51,16 +51,17 @@ class ParticleTrace(Struct, frozen=True, kw_only=True):
     """Particle positions of the kept iterations in the camera frame, one row ``[iteration, x, y, z]`` each."""
 
 
-class Prospect(Part, frozen=True, kw_only=True):
+class LoneCandidate(Part, frozen=True, kw_only=True):
     """C_i by itself: to be looked at alone, once for all hypotheses that it is part of."""
 
+    known_as = "Prospect"
     candidate: Candidate | None
     """None in the one part of a frame without candidates."""
     n_objects: int | None
     """N_c of the frame; None where it is not known."""
 
 
-class Start(Struct, frozen=True, kw_only=True):
+class LonePose(Struct, frozen=True, kw_only=True):
     """Where a candidate's object stands if it is the only one on the table."""
 
     T_camera_object: Pose
@@ -74,11 +75,11 @@ class Start(Struct, frozen=True, kw_only=True):
     """Share of its claim that it explains; asked for likewise."""
 
 
-GLIMPSE_STRIDE = 2
-"""Glimpses keep every second pixel of every second row."""
+PATCH_STRIDE = 2
+"""Patches keep every second pixel of every second row."""
 
 
-class Glimpse(Struct, frozen=True, kw_only=True):
+class DepthPatch(Struct, frozen=True, kw_only=True):
     """What a candidate's object shows at its start: every second pixel of the rectangle about it."""
 
     left: int
@@ -90,16 +91,17 @@ class Glimpse(Struct, frozen=True, kw_only=True):
     """What the cost of the scene changes by where the object is in sight, metres."""
 
 
-class Sighting(Part, frozen=True, kw_only=True):
+class LoneEstimate(Part, frozen=True, kw_only=True):
     """What the look at one candidate alone found; nothing in the paper's plain form, which takes none."""
 
+    known_as = "Sighting"
     n_objects: int | None
     candidate: Candidate | None = None
     """What was looked at; None in the one part of a frame without candidates."""
     share: float = 0.1
     """With N_c unknown the object must explain so much of what it claims: a tenth, or what an appraisal asks for."""
-    start: Start | None = None
-    glimpse: Glimpse | None = None
+    start: LonePose | None = None
+    glimpse: DepthPatch | None = None
 
 
 class Offer(Struct, frozen=True, kw_only=True):
@@ -148,7 +150,7 @@ class Hypothesis(Part, frozen=True, kw_only=True):
     candidates: tuple[Candidate, ...]
     left_out: int = 0
     """Combinations of the frame that the cap left out."""
-    starts: tuple[Start, ...] = ()
+    starts: tuple[LonePose, ...] = ()
     """Of each candidate, where there were looks at each alone. In later rounds the last candidates have none: they are
     looked for among the others, in this order."""
     charges: tuple[float, ...] = ()

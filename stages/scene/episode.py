@@ -18,7 +18,7 @@ Section = tuple[str, list[str]]
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ReportedLook:
     """One perceived scene."""
 
     purpose: str
@@ -36,7 +36,7 @@ class Episode:
     """Everything the report tells, in order."""
 
     verdict: Verdict
-    looks: tuple[Look, ...]
+    looks: tuple[ReportedLook, ...]
     plans: tuple[Plan, ...]
     outcomes: tuple[Outcome, ...]
     judgement: Judgement
@@ -94,7 +94,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequen
     ]
 
 
-def _scenes(looks: Sequence[Look]) -> list[str]:
+def _scenes(looks: Sequence[ReportedLook]) -> list[str]:
     chosen = {
         "goal": _newest(looks, "goal"),
         "start": _newest(looks, "start"),
@@ -105,7 +105,7 @@ def _scenes(looks: Sequence[Look]) -> list[str]:
     return table([name.upper() for name in columns], [[_clip(cell, 31) for cell in row] for row in rows])
 
 
-def _newest(looks: Sequence[Look], purpose: str) -> Look | None:
+def _newest(looks: Sequence[ReportedLook], purpose: str) -> ReportedLook | None:
     return next((look for look in reversed(looks) if look.purpose.startswith(purpose)), None)
 
 
@@ -169,7 +169,7 @@ def _reading_order(marked: tuple[Assertion, str]) -> tuple[bool, int]:
     return mark == "✓", ("on", "in", "faces", "has", "clear", "exist").index(assertion.predicate)
 
 
-def _perception(looks: Sequence[Look]) -> list[str]:
+def _perception(looks: Sequence[ReportedLook]) -> list[str]:
     header = ["look", "boxes", "hypotheses", "labels right", "position (worst)", "rotation (worst)"]
     rows = [
         [

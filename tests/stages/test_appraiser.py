@@ -10,7 +10,7 @@ from stages.devices.clutter import write_models
 from stages.estimate import FiltersHere, SceneEstimator
 from stages.hypotheses import Hypotheses
 from stages.messages import Candidate, Candidates, Hypothesis, SceneEstimate
-from stages.messages.digest import Sighting
+from stages.messages.digest import LoneEstimate
 from stages.particle_filter import ParticleFilter
 from stages.perception.detection.boxes import intersection_over_union
 from stages.ranker import Ranker
@@ -52,7 +52,7 @@ def messages(models: Path) -> list:
 
 
 def test_right_labels_are_likely_and_wrong_ones_are_not(messages: list) -> None:
-    sightings = [message for message in messages if isinstance(message, Sighting)]
+    sightings = [message for message in messages if isinstance(message, LoneEstimate)]
     before, after = sightings[: len(sightings) // 2], sightings[len(sightings) // 2 :]
     judged = {(b.candidate.label, b.candidate.confidence): a for b, a in zip(before, after, strict=True)}
     right = [judged["cereal_box", 0.5], judged["bowl", 0.4]]
@@ -62,7 +62,7 @@ def test_right_labels_are_likely_and_wrong_ones_are_not(messages: list) -> None:
 
 
 def test_boxes_become_those_of_what_is_visible(messages: list) -> None:
-    for sighting in (m for m in messages if isinstance(m, Sighting) and m.share < 0.5 and m.share != 0.1):
+    for sighting in (m for m in messages if isinstance(m, LoneEstimate) and m.share < 0.5 and m.share != 0.1):
         box = photograph(*SHOWN).boxes[sighting.candidate.label]
         assert intersection_over_union(box[None], sighting.candidate.box[None])[0, 0] > 0.85
 

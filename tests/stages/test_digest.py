@@ -29,7 +29,7 @@ from stages.messages import (
     SceneEstimate,
     SceneGraph,
 )
-from stages.messages.digest import Contender, Prospect, Sighting
+from stages.messages.digest import Contender, LoneCandidate, LoneEstimate
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
 from stages.results import BopResults
@@ -63,7 +63,7 @@ def enumerate_(
     sightings = [
         filter_stage.on_prospect(each, observation, ctx) if filter_stage else blind(each)
         for each in prospects
-        if isinstance(each, Prospect)
+        if isinstance(each, LoneCandidate)
     ]
     return [observation, *stage.on_sightings(sightings, ctx)], ctx
 
@@ -79,8 +79,8 @@ def ranked(
     return Ranker(Ranker.Config()).on_contenders(found, observation, ctx)
 
 
-def blind(prospect: Prospect) -> Sighting:
-    return Sighting(
+def blind(prospect: LoneCandidate) -> LoneEstimate:
+    return LoneEstimate(
         index=prospect.index, count=prospect.count, n_objects=prospect.n_objects, candidate=prospect.candidate
     )
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.common.datasets import Image
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate
+from stages.perception.filter.particle_filter import Rectangle
 from stages.perception.observation.preprocessing import preprocess
 from stages.perception.rendering.rasteriser import Float32s, Soup, View, inverse_depth
 
-Region = tuple[int, int, int, int]
-"""x0, y0, x1, y1 in pixels, x1 and y1 exclusive."""
 _MAX_HEIGHT = 0.6
 """Metres above the support plane; what the main job takes as well."""
 _TOLERANCE = 0.01
@@ -57,11 +56,11 @@ class Observed:
         return self.view.rays() * self.depth[..., None]
 
     @property
-    def whole(self) -> Region:
+    def whole(self) -> Rectangle:
         """All of the image."""
         return 0, 0, self.view.width, self.view.height
 
-    def region(self, box: Floats, margin: float = 0.0) -> Region:
+    def region(self, box: Floats, margin: float = 0.0) -> Rectangle:
         """Pixels of a box and a share of its size around it, inside the image, at least one."""
         reach = margin * float((box[2:] - box[:2]).max())
         size = np.array([self.view.width, self.view.height])
@@ -100,7 +99,7 @@ class Crop:
         return Crop._cut(observed, observed.region(candidate.box, _MARGIN), stride, gain)
 
     @staticmethod
-    def _cut(observed: Observed, region: Region, stride: int, gain: Floats) -> Crop:
+    def _cut(observed: Observed, region: Rectangle, stride: int, gain: Floats) -> Crop:
         x0, y0, x1, y1 = region
         part = np.s_[y0:y1:stride, x0:x1:stride]
         hiding = np.where(observed.foreground[part], _HIDDEN, _VIOLATION)

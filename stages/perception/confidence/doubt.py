@@ -21,7 +21,7 @@ from stages.perception.confidence.comparison import Comparison, Model
 from stages.perception.confidence.evidence import ORDINARY_NOISE, Evidence, Judged, Others, Rival
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.proposals import Dof
-from stages.perception.hypotheses.unexplained import Region, is_contradicted, unknown_regions
+from stages.perception.hypotheses.unexplained import UnexplainedRegion, is_contradicted, unknown_regions
 from stages.perception.refinement.refinement import RefinedObject
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue
@@ -57,7 +57,7 @@ class SceneDoubt:
     probabilities: Floats
     """Of the hypotheses."""
     objects: tuple[PoseDoubt, ...]
-    unknown: tuple[Region, ...]
+    unknown: tuple[UnexplainedRegion, ...]
 
 
 def judged(item: ObjectPose, refined: RefinedObject) -> Judged:

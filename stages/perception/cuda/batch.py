@@ -28,7 +28,7 @@ _TEAMWORK = 2048
 
 
 @dataclass(frozen=True)
-class Look:
+class CostInputs:
     """What particles are compared with: a window, the plane below (unit normal, offset) and the form of the cost."""
 
     window: Window
@@ -36,9 +36,9 @@ class Look:
     form: CostForm
 
     @staticmethod
-    def of(likelihood: ObjectLikelihood) -> Look:
+    def of(likelihood: ObjectLikelihood) -> CostInputs:
         """What a likelihood compares with."""
-        return Look(likelihood.window, likelihood.plane, likelihood.form)
+        return CostInputs(likelihood.window, likelihood.plane, likelihood.form)
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ class Batch:
     hypothesis: ``windows`` tells the backgrounds of the hypotheses apart, ``objects`` the meshes.
     """
 
-    def __init__(self, shapes: Sequence[Shape], looks: Sequence[Look], launch: Launch | None = None) -> None:
+    def __init__(self, shapes: Sequence[Shape], inputs: Sequence[CostInputs], launch: Launch | None = None) -> None:
         self.launch = launch or Launch()
         self._meshes = _meshes(shapes, self.launch)
-        self._windows = _windows(looks)
-        self.bases = np.array([look.window.base for look in looks])
+        self._windows = _windows(inputs)
+        self.bases = np.array([each.window.base for each in inputs])
         """Cost of each window without the object, W, metres times pixels."""
-        widest = max(look.window.view.width for look in looks)
+        widest = max(each.window.view.width for each in inputs)
         # Polish looks at the rows above and below.
         words = max(self.launch.z_buffer_bytes // 4, 3 * widest)
-        words = min(words, max(look.window.factor.size for look in looks))
+        words = min(words, max(each.window.factor.size for each in inputs))
         self._shared_bytes = 4 * (words + self.launch.threads)
         self._room: list[Any] = []
         self.middles = put(np.array([[*shape.centre, shape.diameter] for shape in shapes]), np.float32)
@@ -172,19 +172,19 @@ def _team(soup: Soup, threads: int) -> int:
     return min(threads, 32, 1 << (share.bit_length() - 1))
 
 
-def _windows(looks: Sequence[Look]) -> list[Any]:
+def _windows(inputs: Sequence[CostInputs]) -> list[Any]:
     """views, first pixels, pixels (4 x N), planes and limits of all windows, one after the other."""
-    sizes = [look.window.factor.size for look in looks]
+    sizes = [each.window.factor.size for each in inputs]
     layers = [
         np.stack([a.ravel() for a in (w.inverse_background, w.observed, w.factor, w.credit)])
-        for w in (look.window for look in looks)
+        for w in (each.window for each in inputs)
     ]
     arrays = (
-        np.stack([look.window.view.numbers for look in looks]),
+        np.stack([each.window.view.numbers for each in inputs]),
         np.cumsum([0, *sizes[:-1]]).astype(np.int32),
         np.concatenate(layers, 1).astype(np.float32),
-        np.stack([look.plane for look in looks]).astype(np.float32),
-        np.array([limits(look.form) for look in looks], np.float32),
+        np.stack([each.plane for each in inputs]).astype(np.float32),
+        np.array([limits(each.form) for each in inputs], np.float32),
     )
     return [put(array, array.dtype) for array in arrays]
 

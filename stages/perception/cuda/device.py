@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from runner.contract import Refused
-from stages.perception.filter.evolution import CPU, Device
+from stages.perception.filter.iterations import CPU, Device
 
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -22,7 +22,7 @@ def chosen_device(device: str, *, place: str) -> Device:
         return CPU
     obstacle = cuda_obstacle()
     if obstacle is None:
-        from stages.perception.cuda.evolution import CUDA
+        from stages.perception.cuda.iterations import CUDA
 
         return CUDA
     if device == "cuda":

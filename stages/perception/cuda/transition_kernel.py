@@ -20,7 +20,7 @@ import numpy as np
 from stages.perception.cuda.cost_kernel import NOTHING, block_greatest, block_sum
 from stages.perception.cuda.random_numbers import normals, uniforms
 from stages.perception.cuda.scalars import cuda
-from stages.perception.filter.evolution import PROGRESS, THINNED
+from stages.perception.filter.iterations import PROGRESS, THINNED
 from stages.perception.filter.likelihood import _SLACK, _STRAY
 
 _f = np.float32

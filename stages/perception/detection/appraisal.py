@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.messages.digest import GLIMPSE_STRIDE, Glimpse
+from stages.messages.digest import PATCH_STRIDE, DepthPatch
 from stages.perception.detection.appearance import Bytes, Mask
 from stages.perception.detection.labels import Judge
 from stages.perception.detection.outline import HIDES
 from stages.perception.detection.propose import confidences
-from stages.perception.detection.regions import Region, elevation_of
+from stages.perception.detection.regions import ImageRegion, elevation_of
 from stages.perception.rendering.rasteriser import Float32s, View
 
 _OUTLINE = 1.5
@@ -48,7 +48,9 @@ class Appraisal:
     """N: so much of the readings that it covers an object must explain to be believed, whatever else is there."""
 
 
-def second_confidences(judge: Judge, rgb: Bytes, regions: Sequence[Region | None], labels: Sequence[int]) -> Floats:
+def second_confidences(
+    judge: Judge, rgb: Bytes, regions: Sequence[ImageRegion | None], labels: Sequence[int]
+) -> Floats:
     """v(L | silhouette) of each candidate's label, 0 where hardly anything is visible (None); N."""
     seen = [region for region in regions if region is not None]
     found = np.zeros(len(regions))
@@ -73,13 +75,13 @@ def bounded_likeness(alike: Floats) -> Floats:
     return np.clip(alike, 0.0, _MOST_ALIKE)
 
 
-def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Floats) -> Region | None:
+def silhouette(glimpse: DepthPatch, depth: Float32s, view: View, T_camera_table: Floats) -> ImageRegion | None:
     """An object's silhouette as a region of the image; None where hardly anything of it is visible.
 
     ``depth`` is H x W metres, 0 where there is no reading.
     """
-    left, top = GLIMPSE_STRIDE * glimpse.left, GLIMPSE_STRIDE * glimpse.top
-    layer = glimpse.inverse.repeat(GLIMPSE_STRIDE, 0).repeat(GLIMPSE_STRIDE, 1)
+    left, top = PATCH_STRIDE * glimpse.left, PATCH_STRIDE * glimpse.top
+    layer = glimpse.inverse.repeat(PATCH_STRIDE, 0).repeat(PATCH_STRIDE, 1)
     layer = layer[: view.height - top, : view.width - left]
     bottom, right = top + layer.shape[0], left + layer.shape[1]
     whole, read = layer > 0, depth[top:bottom, left:right]
@@ -91,7 +93,7 @@ def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Fl
     rays = view.sampled(left, top, right, bottom, 1).rays()
     height = (rays * normal).sum(-1) * z - (normal * origin).sum()
     metres = float(np.median(z[mask])) / view.fx
-    return Region(
+    return ImageRegion(
         box=np.array([left, top, right, bottom], float),
         mask=mask,
         objectness=_OUTLINE,
@@ -103,7 +105,7 @@ def silhouette(glimpse: Glimpse, depth: Float32s, view: View, T_camera_table: Fl
     )
 
 
-def visible_mask(region: Region, view: View) -> Mask:
+def visible_mask(region: ImageRegion, view: View) -> Mask:
     """Where in the image a silhouette is seen, H x W."""
     shown = np.zeros((view.height, view.width), bool)
     x0, y0, x1, y1 = region.box.astype(int)
@@ -111,7 +113,7 @@ def visible_mask(region: Region, view: View) -> Mask:
     return shown
 
 
-def visible_box(region: Region) -> Floats:
+def visible_box(region: ImageRegion) -> Floats:
     """The box of what is seen of a silhouette: x0, y0, x1, y1 in pixels."""
     rows, columns = np.flatnonzero(region.mask.any(1)), np.flatnonzero(region.mask.any(0))
     return np.tile(region.box[:2], 2) + np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])

@@ -9,7 +9,7 @@ import torch
 
 from stages.geometry.arrays import Floats
 from stages.perception.detection.appearance import Bytes, Looks, square
-from stages.perception.detection.regions import Region
+from stages.perception.detection.regions import ImageRegion
 from stages.perception.detection.views import Views, projected, unit
 from stages.perception.rendering.rasteriser import Float32s
 
@@ -41,7 +41,7 @@ class Judge:
         longest = self._views.extent.max(1)
         return 0.5 * float(longest.min()), 1.25 * float(longest.max())
 
-    def scores(self, regions: Sequence[Region], rgb: Bytes) -> Floats:
+    def scores(self, regions: Sequence[ImageRegion], rgb: Bytes) -> Floats:
         """How much each region looks like the best view of each label, N x L; N > 0."""
         looks = Looks.of([square(_window(rgb, region), region.mask, region.whole) for region in regions])
         likeness = self._likeness(regions, looks)
@@ -54,7 +54,7 @@ class Judge:
             scores[i] = np.maximum.reduceat(total, np.cumsum([0, *map(len, closest[:-1])]))
         return scores
 
-    def _likeness(self, regions: Sequence[Region], looks: Looks) -> Floats:
+    def _likeness(self, regions: Sequence[ImageRegion], looks: Looks) -> Floats:
         """Sum of all likenesses but that of cells, regions x views; views from another elevation are out."""
         views = self._views
         last = unit((looks.last - looks.last.mean(0)) / self._spread)
@@ -71,7 +71,7 @@ class Judge:
         elevation = np.array([region.elevation for region in regions])
         return np.where(np.abs(elevation[:, None] - views.elevation) > _ELEVATION, -np.inf, total)
 
-    def _size(self, regions: Sequence[Region]) -> Floats:
+    def _size(self, regions: Sequence[ImageRegion]) -> Floats:
         """How far width and height are off, 0 to -2; what is partly hidden may be smaller."""
         total = np.zeros((len(regions), len(self._views.label)))
         hidden = np.array([region.hidden for region in regions])[:, None]
@@ -95,7 +95,7 @@ class Judge:
         return alike.view(len(index), -1, len(cells)).amax(1).mean(1).numpy()
 
 
-def _window(rgb: Bytes, region: Region) -> Bytes:
+def _window(rgb: Bytes, region: ImageRegion) -> Bytes:
     x0, y0, x1, y1 = region.box.astype(int)
     return rgb[y0:y1, x0:x1]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.messages.digest import GLIMPSE_STRIDE, Glimpse
+from stages.messages.digest import PATCH_STRIDE, DepthPatch
 from stages.perception.detection.appearance import Bytes
 from stages.perception.rendering.rasteriser import Float32s
 
@@ -25,7 +25,7 @@ _LEAST = 20
 """Points of an outline below which it says nothing."""
 
 
-def faintness(glimpses: Sequence[Glimpse], rgb: Bytes, depth: Float32s) -> Floats:
+def faintness(glimpses: Sequence[DepthPatch], rgb: Bytes, depth: Float32s) -> Floats:
     """Share of each object's outline at which the photograph goes on in the same colour; NaN where hardly any is free.
 
     What has an outline of its own differs from what is beside it; what merely fits into a surface has borders where
@@ -38,11 +38,11 @@ def faintness(glimpses: Sequence[Glimpse], rgb: Bytes, depth: Float32s) -> Float
     return np.array([_faintness(glimpse, lab, depth, scale) for glimpse in glimpses])
 
 
-def _faintness(glimpse: Glimpse, lab: Float32s, depth: Float32s, scale: float) -> float:
+def _faintness(glimpse: DepthPatch, lab: Float32s, depth: Float32s, scale: float) -> float:
     beside = _BESIDE * scale
     margin = int(2 * beside)
-    layer = np.pad(glimpse.inverse.repeat(GLIMPSE_STRIDE, 0).repeat(GLIMPSE_STRIDE, 1), margin)
-    corner = GLIMPSE_STRIDE * np.array([glimpse.left, glimpse.top]) - margin
+    layer = np.pad(glimpse.inverse.repeat(PATCH_STRIDE, 0).repeat(PATCH_STRIDE, 1), margin)
+    corner = PATCH_STRIDE * np.array([glimpse.left, glimpse.top]) - margin
     points = _outline(layer > 0)
     outwards = beside * _outwards(layer > 0, points, beside)
     inside, outside = (np.rint(points + side * outwards).astype(int) for side in (-1, 1))

@@ -13,7 +13,7 @@ from stages.perception.detection.alignment import aligned
 from stages.perception.detection.appearance import Bytes
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.detection.labels import Judge
-from stages.perception.detection.regions import Region, regions
+from stages.perception.detection.regions import ImageRegion, regions
 from stages.perception.detection.views import Views
 from stages.perception.rendering.rasteriser import Float32s, View
 
@@ -65,14 +65,14 @@ class Proposer:
         return _chosen(found, confidences(found, self._judge.scores(found, small)), step, most)
 
 
-def confidences(found: list[Region], scores: Floats) -> Floats:
+def confidences(found: list[ImageRegion], scores: Floats) -> Floats:
     """v(L_j | B_i): softmax over the labels and one class for everything else."""
     outline = np.array([region.objectness for region in found])[:, None]
     strength = np.exp((scores + _OUTLINE * outline - _BACKGROUND) / _SHARPNESS)
     return strength / (1 + strength.sum(1, keepdims=True))
 
 
-def _chosen(found: list[Region], confidences: Floats, step: int, most: int) -> Proposals:
+def _chosen(found: list[ImageRegion], confidences: Floats, step: int, most: int) -> Proposals:
     """The most confident boxes with labels, best first.
 
     What has the label, or the place, of one that is chosen already is worth less: an object that is there once should

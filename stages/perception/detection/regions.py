@@ -43,7 +43,7 @@ _WHOLE = 0.3
 
 
 @dataclass(frozen=True)
-class Region:
+class ImageRegion:
     """A piece of the image."""
 
     box: Floats
@@ -83,7 +83,7 @@ class _Picture:
 def regions(
     rgb: Bytes, depth: Float32s, view: View, rng: np.random.Generator, *, up: Floats | None,
     sizes: tuple[float, float], most: int,
-) -> list[Region]:  # fmt: skip
+) -> list[ImageRegion]:  # fmt: skip
     """Up to ``most`` pieces, those with the clearest outline first.
 
     ``depth`` is H x W metres (0 no reading), ``up`` the direction against gravity (camera frame) where it is known, and
@@ -192,7 +192,7 @@ def _superpixels(picture: _Picture, zone: Mask) -> Labels:
 
 def _best(
     picture: _Picture, found: Sequence[tuple[Pieces, Support | None]], sizes: tuple[float, float], most: int
-) -> list[Region]:
+) -> list[ImageRegion]:
     """The pieces of a fitting size with the clearest outlines, no two of them alike."""
     boxes = np.concatenate([pieces.boxes for pieces, _ in found])
     depth, pixels = (np.concatenate([getattr(p, name) for p, _ in found]) for name in ("depth", "pixels"))
@@ -200,7 +200,7 @@ def _best(
     origin = [(i, k) for i, (pieces, _) in enumerate(found) for k in range(len(pieces.boxes))]
     longest = (boxes[:, 2:] - boxes[:, :2]).max(1) * depth / picture.view.fx
     fitting = np.flatnonzero((pixels >= _SMALLEST) & (longest > sizes[0]) & (longest < sizes[1]))
-    kept: list[Region] = []
+    kept: list[ImageRegion] = []
     for index in survivors(boxes[fitting], scores[fitting], _SAME):
         i, k = origin[fitting[index]]
         region = _region(picture, *found[i], index=k, score=float(scores[fitting[index]]))
@@ -211,7 +211,9 @@ def _best(
     return kept
 
 
-def _region(picture: _Picture, pieces: Pieces, support: Support | None, *, index: int, score: float) -> Region | None:
+def _region(
+    picture: _Picture, pieces: Pieces, support: Support | None, *, index: int, score: float
+) -> ImageRegion | None:
     """One piece without ragged edges; None where too little is left."""
     x0, y0, x1, y1 = pieces.boxes[index].astype(int)
     chosen = np.zeros(int(pieces.labels.max()) + 1, bool)
@@ -226,7 +228,7 @@ def _region(picture: _Picture, pieces: Pieces, support: Support | None, *, index
     metres = float(np.median(picture.depth[window][mask])) / view.fx
     cut = min(x0, y0) < 3 or x1 > view.width - 3 or y1 > view.height - 3
     ray = np.array([((x0 + x1) / 2 - view.cx) / view.fx, ((y0 + y1) / 2 - view.cy) / view.fy, 1.0])
-    return Region(
+    return ImageRegion(
         box=np.array([x0, y0, x1, y1], float),
         mask=mask,
         objectness=score,

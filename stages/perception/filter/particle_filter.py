@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.perception.filter.evolution import (
+from stages.perception.filter.iterations import (
     CPU,
     PROGRESS,
     THINNED,
     Device,
     Generation,
+    IterationSettings,
     Population,
-    Step,
-    evolved,
+    iterated,
     resampled,
     steps,
 )
@@ -67,7 +67,7 @@ class _Phase:
 
     likelihood: ObjectLikelihood
     directions: Floats
-    steps: tuple[Step, ...]
+    steps: tuple[IterationSettings, ...]
 
 
 @dataclass(frozen=True)
@@ -280,8 +280,8 @@ def _evolve(runs: Sequence[_Run], number: int) -> None:
         for run in runs:
             run.begin()
     plan, settings = runs[0].phases[number].steps, runs[0].settings
-    evolution = evolved([run.population(number) for run in runs], plan, settings, runs[0].device)
-    for run, poses, history in zip(runs, evolution.population(), evolution.history(), strict=True):
+    iterations = iterated([run.population(number) for run in runs], plan, settings, runs[0].device)
+    for run, poses, history in zip(runs, iterations.population(), iterations.history(), strict=True):
         run.went(poses, history)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.messages.digest import GLIMPSE_STRIDE, Glimpse, Start
+from stages.messages.digest import PATCH_STRIDE, DepthPatch, LonePose
 from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
 from stages.perception.filter.particle_filter import pixels
 from stages.perception.observation.plane import height_above, stands_out
@@ -96,7 +96,7 @@ def pixel_costs(
     return costs
 
 
-def charge(box: Floats, start: Start, share: float) -> float:
+def charge(box: Floats, start: LonePose, share: float) -> float:
     """What an object costs by being there, metres times pixels: it must explain more to be worth having.
 
     Always a tenth of what its box would cost, were it filled with readings as far from the plane as the object rises
@@ -151,14 +151,14 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
     return cost, float(shown.sum() / max(1, silhouette.sum()))
 
 
-def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> Glimpse:
+def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> DepthPatch:
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse
-    rows, columns = part = _part(shown[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE])
+    rows, columns = part = _part(shown[::PATCH_STRIDE, ::PATCH_STRIDE])
     composition = Composition(scene, form, [box])
     change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
-    inverse, change = (np.where(shown, a, 0.0)[::GLIMPSE_STRIDE, ::GLIMPSE_STRIDE][part] for a in (layer, change))
-    return Glimpse(
+    inverse, change = (np.where(shown, a, 0.0)[::PATCH_STRIDE, ::PATCH_STRIDE][part] for a in (layer, change))
+    return DepthPatch(
         left=columns.start,
         top=rows.start,
         inverse=np.ascontiguousarray(inverse, np.float32),
@@ -169,7 +169,7 @@ def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) 
 class FirstLook:
     """Ranks combinations of candidates by what their objects would cost together where each stands if alone."""
 
-    def __init__(self, glimpses: Sequence[Glimpse], charges: Sequence[float] | None = None) -> None:
+    def __init__(self, glimpses: Sequence[DepthPatch], charges: Sequence[float] | None = None) -> None:
         """``charges`` are what each object costs by being there, metres times pixels."""
         self._glimpses = glimpses
         self._charges = charges or [0.0] * len(glimpses)
@@ -189,7 +189,7 @@ class FirstLook:
             nearer = one.inverse > self._inverse[part]
             np.copyto(self._inverse[part], one.inverse, where=nearer)
             np.copyto(self._change[part], one.change, where=nearer)
-        return _sum(self._change) * GLIMPSE_STRIDE**2 + sum(self._charges[i] for i in chosen)
+        return _sum(self._change) * PATCH_STRIDE**2 + sum(self._charges[i] for i in chosen)
 
 
 def _part(shown: NDArray[np.bool_]) -> tuple[slice, slice]:

@@ -15,7 +15,7 @@ _APART = 0.01
 """Metres between the origins of two poses of one object; two of its kind can hardly stand nearer to each other."""
 
 
-def distinct(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Floats] | None = None) -> list[int]:
+def unrepeated(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Floats] | None = None) -> list[int]:
     """Indices of those that show no object that one before them shows.
 
     Two show the same object if they have its label, one's box (x0, y0, x1, y1) lies mostly in the other's and, where

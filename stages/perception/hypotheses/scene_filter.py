@@ -11,8 +11,8 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.geometry.masks import opened
-from stages.messages.digest import Glimpse
-from stages.perception.filter.evolution import CPU, Device
+from stages.messages.digest import DepthPatch
+from stages.perception.filter.iterations import CPU, Device
 from stages.perception.filter.likelihood import ObservedScene, with_object
 from stages.perception.filter.particle_filter import ObjectFilter, Task, Track, pixels, run_together
 from stages.perception.filter.settings import FilterSettings
@@ -128,7 +128,7 @@ class SceneFilter:
             self._remember(key, tracks[key])
         return [tracks[key] for key in keys]
 
-    def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track, *, anywhere: bool = False) -> Glimpse:
+    def glimpse(self, scene: ObservedScene, suspect: Suspect, track: Track, *, anywhere: bool = False) -> DepthPatch:
         """What a track would show, for the first ranking of combinations; ``anywhere`` counts what it explains outside
         its box too."""
         height, width = scene.depth.shape

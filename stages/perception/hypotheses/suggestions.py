@@ -14,7 +14,7 @@ from stages.geometry.poses import inverse, rotate
 from stages.messages.digest import Candidate, Offer
 from stages.messages.scene import ObjectPose
 from stages.perception.filter.likelihood import ObservedScene
-from stages.perception.hypotheses.unexplained import Region, unexplained, unknown_regions
+from stages.perception.hypotheses.unexplained import UnexplainedRegion, unexplained, unknown_regions
 from stages.perception.rendering.rasteriser import Float32s
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue
@@ -59,7 +59,7 @@ class Suggestions:
             fitting.sort(key=lambda label: min(abs(height - top) for height in self._heights(label)))
             yield from _offers(fitting, region.box)
 
-    def _may_show(self, label: str, region: Region) -> bool:
+    def _may_show(self, label: str, region: UnexplainedRegion) -> bool:
         return bool(np.linalg.norm(region.extent_table) < np.linalg.norm(self._catalogue[label].dimensions) + _LEEWAY)
 
     def _heights(self, label: str) -> list[float]:

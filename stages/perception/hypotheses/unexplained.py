@@ -32,7 +32,7 @@ _CONTRADICTED = 0.3
 
 
 @dataclass(frozen=True)
-class Region:
+class UnexplainedRegion:
     """Connected readings above the plane that no object explains."""
 
     box: Floats
@@ -44,7 +44,7 @@ class Region:
     """Edges of that box, metres."""
 
 
-def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[Region, ...]:
+def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[UnexplainedRegion, ...]:
     """Clusters what stands on the plane and belongs to no object, the largest first.
 
     ``layers`` are the objects' inverse depths, H x W each. Readings within a few pixels of a silhouette do not count:
@@ -89,7 +89,7 @@ def unexplained(scene: ObservedScene, layers: Sequence[Float32s], *, edge: int) 
     return open_readings
 
 
-def _region(scene: ObservedScene, mask: Mask) -> Region | None:
+def _region(scene: ObservedScene, mask: Mask) -> UnexplainedRegion | None:
     rows, columns = np.nonzero(mask)
     z = scene.depth[rows, columns].astype(np.float64)
     if len(rows) < _POINTS or float((z**2).sum()) / (scene.view.fx * scene.view.fy) < _AREA:
@@ -99,7 +99,7 @@ def _region(scene: ObservedScene, mask: Mask) -> Region | None:
     low, high = np.percentile(rotate(T[:3, :3].T, points), [2, 98], axis=0)
     if high[2] < _TOP:
         return None
-    return Region(box_of(mask), len(rows), (low + high) / 2, high - low)
+    return UnexplainedRegion(box_of(mask), len(rows), (low + high) / 2, high - low)
 
 
 def _margin(scene: ObservedScene) -> Floats:

@@ -12,7 +12,7 @@ TABLE = "table"
 
 
 @dataclass(frozen=True)
-class Region:
+class VirtualRegion:
     """A virtual object of the goal, as the planner sees it."""
 
     name: str
@@ -36,7 +36,7 @@ class Problem:
     """Items of the goal on and in which nothing may be."""
     concave: frozenset[str]
     graspable: frozenset[str]
-    regions: Mapping[str, Region]
+    regions: Mapping[str, VirtualRegion]
     """Child -> the region in which it belongs."""
     held: frozenset[str]
     """Children that are in their region now."""
@@ -63,7 +63,7 @@ class Problem:
             clear=frozenset(item.arguments[0] for item in goal.assertions if item.predicate == "clear"),
             concave=frozenset(containers(goal) | containers(current)),
             graspable=graspable,
-            regions={item.child: Region(item.name, item.parent, item.child) for item in goal.virtual_objects},
+            regions={item.child: VirtualRegion(item.name, item.parent, item.child) for item in goal.virtual_objects},
             held=held,
             faced=frozenset(sides(goal)),
             turned=turned,

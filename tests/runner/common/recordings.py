@@ -15,7 +15,7 @@ from runner.message.codec import Envelope, LogLine, Lost, Step, pack
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Ready
 from runner.process.step import Executor, receive, step_time
-from runner.recording.recording import RUN, Verdict
+from runner.recording.recording import RUN, Completeness
 from runner.recording.writer import Manifest, RecordingWriter, topic
 from tests.runner.common.runs import TOYS
 
@@ -32,7 +32,7 @@ def manifest(graph: Graph, path: Path, settings: tuple[str, ...] = ()) -> Manife
 
 def record_toys(
     folder: Path, *settings: str, keep: Keep = lambda record: record, more: Iterable[Recorded] = ()
-) -> tuple[Path, Verdict]:
+) -> tuple[Path, Completeness]:
     """Runs the toy graph in this process and records what ``keep`` lets through, and ``more``."""
     settings = (f"sink.path={folder / 'out.txt'}", *settings)
     graph = load_graph(TOYS, settings)
@@ -47,7 +47,7 @@ def put(writer: RecordingWriter, record: Recorded) -> None:
 
 def record(
     graph: Graph, path: Path, records: Iterable[Recorded], settings: tuple[str, ...] = ()
-) -> tuple[Path, Verdict]:
+) -> tuple[Path, Completeness]:
     """A recording of these records."""
     writer = RecordingWriter(manifest(graph, path, settings), print)
     for one in records:

@@ -26,7 +26,7 @@ from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelop
 from runner.recording import writer as writer_module
 from runner.recording.container import Container, Growing, is_being_written
 from runner.recording.provenance import file_hashes
-from runner.recording.recording import Recording, Verdict
+from runner.recording.recording import Completeness, Recording
 from runner.recording.writer import RecordingWriter
 from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys
 from tests.runner.common.toys import Number, Total
@@ -37,7 +37,7 @@ FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scop
 @pytest.fixture(scope="module")
 def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path, verdict = record_toys(tmp_path_factory.mktemp("toys"))
-    assert verdict == Verdict(True)
+    assert verdict == Completeness(True)
     return path
 
 
@@ -78,7 +78,7 @@ def test_holds_every_message_and_step(toys: Path):
     assert len(recording.steps) == 40
     assert not recording.torn
     assert not recording.damage
-    assert recording.verdict == Verdict(True)
+    assert recording.verdict == Completeness(True)
     assert recording.graph["stages"]["worker"]["replicas"] == 2
     assert recording.metadata["verdict"]["verdict"] == "COMPLETE"
 
@@ -165,7 +165,7 @@ def test_refuses_to_overwrite(toys: Path):
 @pytest.mark.parametrize("lost", ["counter.number#2", "worker.answer#7", "gatherer.total#4", "sink.finished#0"])
 def test_a_lost_message_makes_it_incomplete(tmp_path: Path, lost: str):
     path, verdict = record_toys(tmp_path, keep=lambda record: None if getattr(record, "id", "") == lost else record)
-    assert verdict == Verdict(False, (lost,))
+    assert verdict == Completeness(False, (lost,))
     assert Recording(path).verdict == verdict
     assert f"INCOMPLETE: 1 missing: {lost}" in describe(path)
 

@@ -21,15 +21,15 @@ from hypothesis import strategies as st
 from benchmarks.perception.cuda import deviation, exchanged, problem, resident
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import compose, exp_so3, log_so3, pose, rotate
-from stages.perception.cuda.batch import Batch, Launch, Look
+from stages.perception.cuda.batch import Batch, CostInputs, Launch
 from stages.perception.cuda.cost_kernel import block_sum
 from stages.perception.cuda.device import chosen_device
-from stages.perception.cuda.evolution import CudaEvolution
+from stages.perception.cuda.iterations import CudaIterations
 from stages.perception.cuda.polish_kernel import refine
 from stages.perception.cuda.random_numbers import normals, philox
 from stages.perception.cuda.scalars import SIMULATED
 from stages.perception.cuda.transition_kernel import evolve
-from stages.perception.filter.evolution import THINNED, HostEvolution, Population, Step
+from stages.perception.filter.iterations import THINNED, HostIterations, IterationSettings, Population
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.particle_filter import ObjectFilter, Task, Track, run_together
 from stages.perception.filter.proposals import Dof, Guess, Proposals
@@ -107,8 +107,8 @@ def likelihood(mesh: Mesh, seen: ObservedScene, form: CostForm, box: tuple[int, 
     return ObjectLikelihood(Shape.of(mesh), window, seen, form)
 
 
-def look(cpu: ObjectLikelihood, seen: ObservedScene) -> Look:
-    return Look(cpu.window, seen.plane, cpu.form)
+def cost_inputs(cpu: ObjectLikelihood, seen: ObservedScene) -> CostInputs:
+    return CostInputs(cpu.window, seen.plane, cpu.form)
 
 
 def standing(*, x: float = 0.0, y: float = 0.0, turn: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Floats:
@@ -144,7 +144,7 @@ ANY_POSE = st.builds(
 def test_costs_are_the_cpu_kernels_and_the_oracles(poses: list[Floats], plain: bool, mug: bool) -> None:
     seen, mesh = scene(), MUG if mug else BOX
     cpu = likelihood(mesh, seen, CostForm.paper() if plain else CostForm(), (0, 0, WIDTH, HEIGHT))
-    found = Batch([cpu.shape], [look(cpu, seen)], SMALL).changes(np.stack(poses))
+    found = Batch([cpu.shape], [cost_inputs(cpu, seen)], SMALL).changes(np.stack(poses))
     expected = cpu.costs(np.stack(poses)) - cpu.base
     # A pixel centre within rounding of an edge may fall on either side of it: at most one or two in such a picture.
     pixel = 2.0 if plain else 0.08
@@ -158,7 +158,7 @@ def test_what_reaches_into_the_camera_is_impossible() -> None:
     seen = scene()
     cpu = likelihood(MUG, seen, CostForm(), (0, 0, WIDTH, HEIGHT))
     poses = np.stack([np.column_stack([np.eye(3), [0.0, 0.0, z]]) for z in (0.02, -1.0)])
-    costs = Batch([cpu.shape], [look(cpu, seen)], SMALL).changes(poses)
+    costs = Batch([cpu.shape], [cost_inputs(cpu, seen)], SMALL).changes(poses)
     assert costs.tolist() == [IMPOSSIBLE, IMPOSSIBLE]
 
 
@@ -167,7 +167,7 @@ def test_one_launch_weighs_two_meshes_in_two_windows() -> None:
     a = likelihood(MUG, first, CostForm(), (2, 0, 20, 17))
     b = likelihood(BOX, second, CostForm().truncated(0.015), (4, 1, 24, 18))
     poses = np.stack([standing(x=x, turn=(0.3, 0.2, x)) for x in (-0.1, 0.0, 0.1, 0.05)])
-    batch = Batch([a.shape, b.shape], [look(a, first), look(b, second)], SMALL)
+    batch = Batch([a.shape, b.shape], [cost_inputs(a, first), cost_inputs(b, second)], SMALL)
     found = batch.costs(poses, [0, 1, 1, 0], [0, 1, 0, 1])
     crossed = [ObjectLikelihood(s.shape, w.window, seen, w.form) for s, w, seen in
                ((a, a, first), (b, b, second), (b, a, first), (a, b, second))]  # fmt: skip
@@ -180,10 +180,10 @@ def test_bands_and_teams_change_no_byte() -> None:
     seen = scene()
     cpu = likelihood(MUG, seen, CostForm(), (0, 0, WIDTH, HEIGHT))
     poses = np.stack([standing(turn=(0.4, 1.0, 2.0)), standing(x=0.1, turn=(2.0, 0.1, 0.0))])
-    whole = Batch([cpu.shape], [look(cpu, seen)], SMALL).changes(poses)
+    whole = Batch([cpu.shape], [cost_inputs(cpu, seen)], SMALL).changes(poses)
     assert abs(whole).min() > 0.1
     for launch in (Launch(threads=8, z_buffer_bytes=4, team=1), Launch(threads=8, z_buffer_bytes=300, team=8)):
-        batch = Batch([cpu.shape], [look(cpu, seen)], launch)
+        batch = Batch([cpu.shape], [cost_inputs(cpu, seen)], launch)
         assert batch.changes(poses).tobytes() == whole.tobytes()
 
 
@@ -192,7 +192,7 @@ def test_tensors_are_read_and_written_where_they_lie() -> None:
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     poses, out = torch.as_tensor(around(2), dtype=torch.float32), torch.zeros(2)
     which = torch.zeros(2, dtype=torch.int32)
-    Batch([cpu.shape], [look(cpu, seen)], TINY).write_costs(poses, which, which, out)
+    Batch([cpu.shape], [cost_inputs(cpu, seen)], TINY).write_costs(poses, which, which, out)
     assert out.numpy() == pytest.approx(cpu.costs(poses.numpy()) - cpu.base, rel=1e-4, abs=0.01)
 
 
@@ -205,23 +205,23 @@ def population(
     return Population(poses, cpu, proposals.directions(camera()), proposals, guess, np.random.default_rng(seed))
 
 
-def step(count: int, **changes: Any) -> Step:
+def step(count: int, **changes: Any) -> IterationSettings:
     """An iteration in which nothing moves but by resampling."""
-    return replace(Step(count, 0.0, 0.0, flipped=0, renewed=0, polished=0), **changes)
+    return replace(IterationSettings(count, 0.0, 0.0, flipped=0, renewed=0, polished=0), **changes)
 
 
 def settings_of(**changes: Any) -> FilterSettings:
     return replace(FilterSettings(elitism=False), **changes)
 
 
-def evolved(cpu: ObjectLikelihood, poses: Floats, plan: Step, *, dof: Dof = 6, **changes: Any) -> Floats:
+def iterated(cpu: ObjectLikelihood, poses: Floats, plan: IterationSettings, *, dof: Dof = 6, **changes: Any) -> Floats:
     """The second generation, N x 3 x 4."""
-    evolution = CudaEvolution([population(cpu, poses, dof=dof)], [plan], settings_of(**changes), launch=TINY)
-    assert not evolution.iterate(4)
-    kept = evolution.history()[0][0]
+    iterations = CudaIterations([population(cpu, poses, dof=dof)], [plan], settings_of(**changes), launch=TINY)
+    assert not iterations.iterate(4)
+    kept = iterations.history()[0][0]
     assert kept.cost == pytest.approx(cpu.energies(poses.astype(np.float32)).min(), rel=1e-3, abs=0.02)
     assert kept.positions == pytest.approx(poses[::THINNED, :, 3], abs=1e-6)
-    return evolution.population()[0]
+    return iterations.population()[0]
 
 
 def around(count: int, *, metres: float = 0.02) -> Floats:
@@ -250,7 +250,7 @@ def test_resampling_is_systematic_by_the_weights() -> None:
     seen, count = scene(), 24
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     poses = around(count)
-    following = evolved(cpu, poses, step(count), lambda_r=2.0)
+    following = iterated(cpu, poses, step(count), lambda_r=2.0)
     energies = cpu.energies(poses)
     wished = count * np.exp(-2.0 * (energies - energies.min()))
     wished /= np.exp(-2.0 * (energies - energies.min())).sum()
@@ -262,7 +262,7 @@ def test_resampling_is_systematic_by_the_weights() -> None:
 def test_the_scale_is_chosen_for_the_effective_sample_size() -> None:
     seen, count = scene(), 24
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
-    following = evolved(cpu, around(count), step(count), effective=0.25)
+    following = iterated(cpu, around(count), step(count), effective=0.25)
     kept = np.unique(following[:, :, 3].round(6), axis=0, return_counts=True)[1]
     assert count**2 / (kept**2).sum() == pytest.approx(0.25 * count, abs=2.5)
 
@@ -271,12 +271,12 @@ def test_fewer_particles_follow() -> None:
     seen = scene()
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     poses, plan = around(24), [step(15), step(15), step(9)]
-    evolution = CudaEvolution([population(cpu, poses)], plan, settings_of(), launch=TINY)
-    sizes = [len(evolution.population()[0])]
-    while evolution.iterate(1):
-        sizes.append(len(evolution.population()[0]))
-    assert [*sizes, len(evolution.population()[0])] == [24, 15, 15, 9]
-    alive = (evolution.population()[0][:, None, :, 3] == poses[None, :, :, 3].astype(np.float32)).all(-1)
+    iterations = CudaIterations([population(cpu, poses)], plan, settings_of(), launch=TINY)
+    sizes = [len(iterations.population()[0])]
+    while iterations.iterate(1):
+        sizes.append(len(iterations.population()[0]))
+    assert [*sizes, len(iterations.population()[0])] == [24, 15, 15, 9]
+    alive = (iterations.population()[0][:, None, :, 3] == poses[None, :, :, 3].astype(np.float32)).all(-1)
     assert alive.any(1).all()
 
 
@@ -284,7 +284,7 @@ def test_the_transition_diffuses_about_the_centre() -> None:
     seen, count = scene(), 32
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     T = standing(turn=(0.3, 0.4, 0.5))
-    following = evolved(cpu, np.repeat(T[None], count, 0), step(count, metres=0.004, radians=0.2))
+    following = iterated(cpu, np.repeat(T[None], count, 0), step(count, metres=0.004, radians=0.2))
     shifts = rotate(following[:, :, :3], cpu.shape.centre) + following[:, :, 3] - T[:, :3] @ cpu.shape.centre - T[:, 3]
     assert shifts.std(0) == pytest.approx([0.004] * 3, rel=0.4)
     turns = log_so3(compose(following[:, :, :3], T[:, :3].T))
@@ -300,7 +300,7 @@ def test_upright_objects_stay_upright(flipped: int) -> None:
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     T, up = standing(), seen.T_camera_table[:3, 2]
     plan = step(12, metres=0.0, radians=0.0 if flipped else 0.5, flipped=flipped)
-    following = evolved(cpu, np.repeat(T[None], 12, 0), plan, dof=3)
+    following = iterated(cpu, np.repeat(T[None], 12, 0), plan, dof=3)
     assert following[:, :, 2] == pytest.approx(np.broadcast_to(up, (12, 3)), abs=1e-5)
     assert abs(following[:, :, 0] - T[:, 0]).max() > 0.1
     if flipped:
@@ -313,7 +313,7 @@ def test_flips_spins_renewal_and_elitism() -> None:
     seen, count = scene(), 24
     cpu = likelihood(BOX, seen, CostForm(), (6, 4, 18, 13))
     poses = around(count)
-    following = evolved(cpu, poses, step(count, flipped=10, renewed=6), elitism=True)
+    following = iterated(cpu, poses, step(count, flipped=10, renewed=6), elitism=True)
     drawn = population(cpu, poses)
     fresh = drawn.proposals.initial(drawn.guess, 6, drawn.rng)
     assert following[18:23] == pytest.approx(fresh[:5], abs=1e-6)
@@ -342,7 +342,7 @@ def test_polish_is_the_cpus(dof: Dof) -> None:
     # The last is out of the picture and has nothing to go by.
     assert expected[4] == pytest.approx(poses[4])
     for launch in (TINY, Launch(threads=4, z_buffer_bytes=4)):
-        found = Batch([cpu.shape], [look(cpu, seen)], launch).refined(poses, directions, steps=2, gate=0.03)
+        found = Batch([cpu.shape], [cost_inputs(cpu, seen)], launch).refined(poses, directions, steps=2, gate=0.03)
         assert found == pytest.approx(expected, abs=1e-5)
 
 
@@ -350,7 +350,7 @@ def test_the_first_particles_are_polished() -> None:
     seen = holding(BOX)
     cpu = likelihood(BOX, seen, CostForm(), (0, 0, WIDTH, HEIGHT))
     poses = np.repeat(standing(x=0.004, turn=(0.33, 0.4, 0.5))[None], 6, 0)
-    following = evolved(cpu, poses, step(6, polished=2))
+    following = iterated(cpu, poses, step(6, polished=2))
     moved = cpu.refine(poses[:1], np.eye(6), steps=2, gate=0.03)[0]
     assert abs(moved - poses[0]).max() > 2e-3
     assert following[:2] == pytest.approx(np.stack([moved, moved]), abs=1e-5)
@@ -371,11 +371,11 @@ def two_hypotheses() -> list[Population]:
 
 def test_hypotheses_in_one_batch_end_as_each_alone() -> None:
     chosen = settings_of(elitism=True, lambda_r=3.0)
-    together = CudaEvolution(two_hypotheses(), ANNEALED, chosen, launch=TINY)
+    together = CudaIterations(two_hypotheses(), ANNEALED, chosen, launch=TINY)
     while together.iterate(2):
         pass
     for h in range(2):
-        alone = CudaEvolution([two_hypotheses()[h]], ANNEALED, chosen, launch=TINY)
+        alone = CudaIterations([two_hypotheses()[h]], ANNEALED, chosen, launch=TINY)
         alone.iterate(3)
         assert together.population()[h].tobytes() == alone.population()[0].tobytes()
         costs = [generation.cost for generation in together.history()[h]]
@@ -389,13 +389,13 @@ def test_a_population_that_settles_waits_for_the_others() -> None:
     b = likelihood(BOX, holding(BOX), CostForm(), (4, 3, 16, 12))
     still = population(b, np.repeat(standing(turn=(0.3, 0.4, 0.5))[None], 4, 0))
     plan = [step(4), step(4), step(4), step(4, metres=0.05), step(4, metres=0.05)]
-    evolution = CudaEvolution([still, two_hypotheses()[0]], plan, settings_of(patience=2), launch=TINY)
-    assert evolution.iterate(4)
-    settled = evolution.population()[0]
-    assert not evolution.iterate(4)
-    assert [len(each) for each in evolution.history()] == [3, 5]
-    assert evolution.population()[0].tobytes() == settled.tobytes()
-    host = HostEvolution([still], plan, settings_of(patience=2))
+    iterations = CudaIterations([still, two_hypotheses()[0]], plan, settings_of(patience=2), launch=TINY)
+    assert iterations.iterate(4)
+    settled = iterations.population()[0]
+    assert not iterations.iterate(4)
+    assert [len(each) for each in iterations.history()] == [3, 5]
+    assert iterations.population()[0].tobytes() == settled.tobytes()
+    host = HostIterations([still], plan, settings_of(patience=2))
     assert not host.iterate(4)
     assert len(host.history()[0]) == 3
 

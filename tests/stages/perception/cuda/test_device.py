@@ -4,7 +4,7 @@ import pytest
 from runner.contract import Refused
 from stages.particle_filter import ParticleFilter
 from stages.perception.cuda.device import chosen_device
-from stages.perception.filter.evolution import CPU
+from stages.perception.filter.iterations import CPU
 from tests.stages.perception.scenes import CATALOGUE_FILE
 
 HAS_GPU = numba.cuda.is_available()

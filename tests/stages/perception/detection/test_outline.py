@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from stages.messages.digest import Glimpse
+from stages.messages.digest import DepthPatch
 from stages.perception.detection.outline import faintness
 
 DISTANCE = 0.8
-LOOK = Glimpse(
+LOOK = DepthPatch(
     left=40, top=30, inverse=np.full((60, 80), 1 / DISTANCE, np.float32), change=np.zeros((60, 80), np.float32)
 )
 """Rows 60 to 180 and columns 80 to 240 of 240 x 320 pixels."""
@@ -37,7 +37,7 @@ def test_what_stands_in_front_has_the_border_to_itself() -> None:
 def test_nothing_is_told_of_an_outline_that_others_hide_or_the_image_cuts() -> None:
     rgb, _ = photograph()
     assert np.isnan(faintness([LOOK], rgb, np.full((240, 320), 0.5, np.float32))).all()
-    everything = Glimpse(
+    everything = DepthPatch(
         left=0, top=0, inverse=np.ones((120, 160), np.float32), change=np.zeros((120, 160), np.float32)
     )
     assert np.isnan(faintness([everything], rgb, np.ones((240, 320), np.float32))).all()

@@ -5,18 +5,18 @@ import pytest
 
 from stages.geometry.arrays import Floats
 from stages.perception.detection.boxes import intersection_over_union
-from stages.perception.detection.regions import Region, regions
+from stages.perception.detection.regions import ImageRegion, regions
 from stages.perception.detection.supports import supports
 from tests.stages.perception.detection.scenes import NAMES, T_TABLE_CAMERA, VIEW, Photograph, photograph
 from tests.stages.perception.scenes import CATALOGUE
 
 
-def found(seen: Photograph, *, most: int = 60, seed: int = 0) -> list[Region]:
+def found(seen: Photograph, *, most: int = 60, seed: int = 0) -> list[ImageRegion]:
     rng = np.random.default_rng(seed)
     return regions(seen.rgb, seen.depth, VIEW, rng, up=None, sizes=(0.02, 0.4), most=most)
 
 
-def best(seen: Photograph, name: str, among: list[Region]) -> tuple[Region, float]:
+def best(seen: Photograph, name: str, among: list[ImageRegion]) -> tuple[ImageRegion, float]:
     overlaps = intersection_over_union(seen.boxes[name][None], np.stack([region.box for region in among]))[0]
     return among[int(overlaps.argmax())], float(overlaps.max())
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import random_rotations
-from stages.messages.digest import GLIMPSE_STRIDE, ParticleTrace, Start
+from stages.messages.digest import PATCH_STRIDE, LonePose, ParticleTrace
 from stages.perception.filter.likelihood import CostForm, Shape
 from stages.perception.hypotheses.combinations import cheapest
 from stages.perception.hypotheses.composition import Composition, FirstLook, charge, claim, glimpse, rise, scene_cost
@@ -87,12 +87,12 @@ def test_the_first_look_costs_what_the_composition_costs(seen: Rendered, shapes:
         for chosen in itertools.combinations(range(3), size):
             composition = Composition(seen.scene, FORM, [boxes[i] for i in chosen])
             change = composition.cost([layers[i] for i in chosen]) - composition.cost_of_nothing()
-            assert look.cost(chosen) == pytest.approx(change, rel=0.1, abs=0.2 * GLIMPSE_STRIDE**2)
+            assert look.cost(chosen) == pytest.approx(change, rel=0.1, abs=0.2 * PATCH_STRIDE**2)
 
 
-def start(*, claim: float) -> Start:
+def start(*, claim: float) -> LonePose:
     trace = ParticleTrace(iterations=(), costs=np.zeros(0), positions=np.zeros((0, 4)))
-    return Start(T_camera_object=np.eye(4), trace=trace, rise=0.03, claim=claim)
+    return LonePose(T_camera_object=np.eye(4), trace=trace, rise=0.03, claim=claim)
 
 
 def test_an_object_is_charged_for_its_box_and_for_what_it_claims() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 
 from stages.geometry.poses import pose
 from stages.messages.scene import ObjectPose
-from stages.perception.hypotheses.duplicates import distinct, is_same_scene, without_doubles
+from stages.perception.hypotheses.duplicates import is_same_scene, unrepeated, without_doubles
 
 BOX = np.array([100.0, 100.0, 160.0, 200.0])
 PART = np.array([98.0, 100.0, 162.0, 140.0])
@@ -19,16 +19,16 @@ def item(label: str, place: np.ndarray, box: np.ndarray = BOX) -> ObjectPose:
 
 
 def test_a_box_of_a_part_shows_the_same_object() -> None:
-    assert distinct(["cup", "cup", "cup"], [BOX, PART, BESIDE]) == [0, 2]
+    assert unrepeated(["cup", "cup", "cup"], [BOX, PART, BESIDE]) == [0, 2]
 
 
 def test_other_labels_are_other_objects() -> None:
-    assert distinct(["cup", "mug"], [BOX, BOX]) == [0, 1]
+    assert unrepeated(["cup", "mug"], [BOX, BOX]) == [0, 1]
 
 
 def test_where_places_are_known_they_must_be_one() -> None:
-    assert distinct(["cup", "cup"], [BOX, PART], [HERE, NEAR]) == [0]
-    assert distinct(["cup", "cup"], [BOX, PART], [HERE, THERE]) == [0, 1]
+    assert unrepeated(["cup", "cup"], [BOX, PART], [HERE, NEAR]) == [0]
+    assert unrepeated(["cup", "cup"], [BOX, PART], [HERE, THERE]) == [0, 1]
 
 
 def test_a_scene_has_each_object_once() -> None:

@@ -23,7 +23,7 @@ from runner.contract import Refused
 from stages.messages import SceneGraph, VirtualObject
 from stages.messages.scene import SceneObject
 from stages.planning.symbolic.pddl import DOMAIN, problem_pddl
-from stages.planning.symbolic.problem import Problem, Region
+from stages.planning.symbolic.problem import Problem, VirtualRegion
 from stages.planning.symbolic.search import Solution, actions, breadth_first, check_engine, with_engine
 
 get_environment().credits_stream = None
@@ -51,7 +51,7 @@ def steps(solution: Solution) -> list[str]:
     return [f"{step.item} -> {step.region or step.destination}" for step in solution.steps]
 
 
-def scene(names: list[str], regions: dict[str, Region]) -> SceneGraph:
+def scene(names: list[str], regions: dict[str, VirtualRegion]) -> SceneGraph:
     """A scene graph with the objects' names; poses do not matter here."""
     objects = tuple(SceneObject(name=name, label=name, T_base_object=np.eye(4)) for name in names)
     virtual = tuple(
@@ -138,7 +138,7 @@ def test_what_shows_another_side_is_picked_once_and_moved_when_its_turn_comes():
     assert valid(task, found_actions(task)) and not valid(task, [])
 
 
-REGION = Region("can_near_box", "box", "can")
+REGION = VirtualRegion("can_near_box", "box", "can")
 SIDE_BY_SIDE = problem(
     {"tray": "table", "can": "table", "box": "table"},
     {"tray": "table", "can": "tray", "box": "tray"},

@@ -16,10 +16,18 @@ import numpy as np
 
 from runner.contract import Refused
 from stages.geometry.arrays import Floats
-from stages.perception.cuda.batch import Batch, Launch, Look, put
+from stages.perception.cuda.batch import Batch, CostInputs, Launch, put
 from stages.perception.cuda.cost_kernel import NOTHING
 from stages.perception.cuda.transition_kernel import DONE, SIZE, STEP, evolve
-from stages.perception.filter.evolution import POLISH_GATE, POLISH_STEPS, THINNED, Device, Generation, Population, Step
+from stages.perception.filter.iterations import (
+    POLISH_GATE,
+    POLISH_STEPS,
+    THINNED,
+    Device,
+    Generation,
+    IterationSettings,
+    Population,
+)
 from stages.perception.filter.likelihood import CostForm, Shape, Window
 from stages.perception.filter.settings import FilterSettings
 from stages.perception.rendering.rasteriser import Float32s
@@ -29,15 +37,15 @@ _SHARED_BYTES = 48 * 1024
 _GOLDEN = (5**0.5 - 1) / 2
 
 
-class CudaEvolution:
+class CudaIterations:
     """H populations evolved together on one GPU; each ends with the bytes that it would have alone."""
 
     def __init__(
-        self, populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings, *,
+        self, populations: Sequence[Population], plan: Sequence[IterationSettings], settings: FilterSettings, *,
         launch: Launch | None = None,
     ) -> None:  # fmt: skip
         likelihoods = [population.likelihood for population in populations]
-        self._batch = Batch([each.shape for each in likelihoods], [Look.of(each) for each in likelihoods], launch)
+        self._batch = Batch([each.shape for each in likelihoods], [CostInputs.of(each) for each in likelihoods], launch)
         self._threads = self._batch.launch.threads
         self._plan = list(plan)
         self._queued = 0
@@ -60,17 +68,17 @@ class CudaEvolution:
         return self._queued < len(self._plan) and not self._state.copy_to_host()[:, DONE].all()
 
     def best(self) -> list[float]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         return [min((generation.cost for generation in each), default=np.inf) for each in self.history()]
 
     def population(self) -> list[Floats]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         sizes = self._state.copy_to_host()[:, SIZE]
         poses = self._poses.copy_to_host().reshape(len(sizes), self._capacity, 3, 4).astype(float)
         return [each[:size] for each, size in zip(poses, sizes, strict=True)]
 
     def history(self) -> list[list[Generation]]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         costs, traces = self._history.copy_to_host().astype(float), self._traces.copy_to_host().astype(float)
         steps = self._state.copy_to_host()[:, STEP]
         return [
@@ -82,7 +90,7 @@ class CudaEvolution:
         """What ``evolve`` keeps in shared memory."""
         return 4 * (self._threads + self._capacity)
 
-    def _queue(self, step: Step, stream: Any) -> None:
+    def _queue(self, step: IterationSettings, stream: Any) -> None:
         self._batch.write_costs(self._poses, self._objects, self._windows, self._changes, stream=stream)
         evolve[len(self._state), self._threads, stream, self._shared_bytes()](
             self._changes, self._poses, self._following, self._objects, *self._tables, self._state, self._polished,
@@ -120,14 +128,18 @@ class CudaEvolution:
 
 def evaluator(shape: Shape, window: Window, plane: Float32s, form: CostForm) -> Batch:
     """The GPU's costs and polish of one object in one window; both stay on the device as long as this lives."""
-    return Batch([shape], [Look(window, plane, form)])
+    return Batch([shape], [CostInputs(window, plane, form)])
 
 
-CUDA = Device(evaluator, CudaEvolution)
+CUDA = Device(evaluator, CudaIterations)
 
 
 def _tables(
-    populations: Sequence[Population], batch: Batch, plan: Sequence[Step], settings: FilterSettings, directions: Any
+    populations: Sequence[Population],
+    batch: Batch,
+    plan: Sequence[IterationSettings],
+    settings: FilterSettings,
+    directions: Any,
 ) -> list[Any]:
     """What ``evolve`` reads and nobody writes, in its order."""
     flips = [p.proposals.flips for p in populations]
@@ -157,13 +169,13 @@ def _window(population: Population) -> Floats:
     return np.array([*window.view.numbers, *window.box, *reach, likelihood.base, not likelihood.form.plain], float)
 
 
-def _pools(populations: Sequence[Population], plan: Sequence[Step]) -> Floats:
+def _pools(populations: Sequence[Population], plan: Sequence[IterationSettings]) -> Floats:
     """First guesses for all particles that the phase renews, H x R x 3 x 4."""
     count = max(1, sum(step.renewed for step in plan))
     return np.stack([p.proposals.initial(p.guess, count, p.rng) for p in populations])
 
 
-def _numbers(plan: Sequence[Step], *, elitism: bool) -> Any:
+def _numbers(plan: Sequence[IterationSettings], *, elitism: bool) -> Any:
     """The whole numbers of the schedule, S x 6."""
     fresh = np.cumsum([0, *(step.renewed for step in plan)])
     return np.array(

@@ -1,7 +1,7 @@
-"""How one population evolves through a phase of the schedule, on whichever device: the steps, and the CPU's iterations.
+"""How populations go through a phase of the schedule, on whichever device: its iterations, and how the CPU does them.
 
-``Evolution`` is the narrow place between the filter and a device. The schedule, the windows, first guesses and the last
-polish are the same on both sides of it; random numbers and rounding are each device's own.
+``Iterations`` is the narrow place between the filter and a device. The schedule, the windows, first guesses and the
+last polish are the same on both sides of it; random numbers and rounding are each device's own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _CHECKED = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class IterationSettings:
     """What one iteration makes of a generation."""
 
     count: int
@@ -45,15 +45,15 @@ class Step:
     polished: int
 
 
-def steps(settings: FilterSettings, start: float, end: float, iterations: int) -> tuple[Step, ...]:
+def steps(settings: FilterSettings, start: float, end: float, iterations: int) -> tuple[IterationSettings, ...]:
     """The iterations of a phase in which the annealing goes from ``start`` to ``end``, both between 0 and 1."""
     return tuple(_step(settings, start + (end - start) * (i / iterations)) for i in range(iterations))
 
 
-def _step(settings: FilterSettings, progress: float) -> Step:
+def _step(settings: FilterSettings, progress: float) -> IterationSettings:
     count = settings.count(progress)
     flipped = int(settings.flips * count)
-    return Step(
+    return IterationSettings(
         count,
         settings.metres[0] ** (1 - progress) * settings.metres[1] ** progress,
         settings.radians[0] ** (1 - progress) * settings.radians[1] ** progress,
@@ -87,7 +87,7 @@ class Generation:
     """Some particles, n x 3, camera frame."""
 
 
-class Evolution(Protocol):
+class Iterations(Protocol):
     """Populations on their way through one phase."""
 
     def iterate(self, count: int) -> bool:
@@ -113,51 +113,53 @@ class Device:
     """Where particles are weighed, resampled, moved and polished."""
 
     evaluator: MakeEvaluator
-    evolution: Callable[[Sequence[Population], Sequence[Step], FilterSettings], Evolution]
+    iterations: Callable[[Sequence[Population], Sequence[IterationSettings], FilterSettings], Iterations]
 
 
-def evolved(
-    populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings, device: Device
-) -> Evolution:
+def iterated(
+    populations: Sequence[Population], plan: Sequence[IterationSettings], settings: FilterSettings, device: Device
+) -> Iterations:
     """All populations after the phase; each ends as it would alone, on a GPU they go together."""
     # A schedule of one iteration has no second half: nothing to send to a device.
-    evolution = (device if plan else CPU).evolution(populations, plan, settings)
-    while evolution.iterate(_CHECKED):
+    iterations = (device if plan else CPU).iterations(populations, plan, settings)
+    while iterations.iterate(_CHECKED):
         pass
-    return evolution
+    return iterations
 
 
-class HostEvolution:
+class HostIterations:
     """Iterations on the CPU, one population after the other."""
 
-    def __init__(self, populations: Sequence[Population], plan: Sequence[Step], settings: FilterSettings) -> None:
+    def __init__(
+        self, populations: Sequence[Population], plan: Sequence[IterationSettings], settings: FilterSettings
+    ) -> None:
         self._each = [_Course(population, plan, settings) for population in populations]
 
     def iterate(self, count: int) -> bool:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         left = [each.iterate(count) for each in self._each]
         return any(left)
 
     def best(self) -> list[float]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         return [each.best for each in self._each]
 
     def population(self) -> list[Floats]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         return [each.poses for each in self._each]
 
     def history(self) -> list[list[Generation]]:
-        """As in :class:`Evolution`."""
+        """As in :class:`Iterations`."""
         return [each.history for each in self._each]
 
 
-CPU = Device(CpuEvaluator, HostEvolution)
+CPU = Device(CpuEvaluator, HostIterations)
 
 
 class _Course:
     """One population on the CPU."""
 
-    def __init__(self, population: Population, plan: Sequence[Step], settings: FilterSettings) -> None:
+    def __init__(self, population: Population, plan: Sequence[IterationSettings], settings: FilterSettings) -> None:
         self._population = population
         self._settings = settings
         self._left = list(plan)
@@ -174,7 +176,7 @@ class _Course:
                 break
         return bool(self._left)
 
-    def _advance(self, step: Step) -> None:
+    def _advance(self, step: IterationSettings) -> None:
         costs = self._population.likelihood.energies(self.poses)
         champion = int(np.argmin(costs))
         least = float(costs[champion])
@@ -187,7 +189,7 @@ class _Course:
         explains = self.best < self._population.likelihood.base
         return explains and self._stale >= self._settings.patience and self._settings.schedule is not None
 
-    def _next(self, costs: Floats, champion: Floats, step: Step) -> Floats:
+    def _next(self, costs: Floats, champion: Floats, step: IterationSettings) -> Floats:
         """Resampling and transition: equation 5, then the improvements that are switched on."""
         given, rng = self._population, self._population.rng
         proposals, T_camera_table = given.proposals, given.guess.T_camera_table

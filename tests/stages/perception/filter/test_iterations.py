@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.perception.filter.evolution import CPU, HostEvolution, Population, Step, evolved, steps
+from stages.perception.filter.iterations import CPU, HostIterations, IterationSettings, Population, iterated, steps
 from stages.perception.filter.particle_filter import ObjectFilter, Task, pixels, run_together
 from stages.perception.filter.settings import FilterSettings
 from tests.stages.perception.scenes import CATALOGUE, render, upright
@@ -44,7 +44,7 @@ def test_the_schedule_anneals_and_tapers() -> None:
     ):  # fmt: skip
         assert np.diff(np.log(spreads)) == pytest.approx(np.log(last / first) / 8)
         assert spreads[0] == first
-    assert plan[0] == Step(50, 0.03, SETTINGS.radians[0], flipped=3, renewed=2, polished=6)
+    assert plan[0] == IterationSettings(50, 0.03, SETTINGS.radians[0], flipped=3, renewed=2, polished=6)
     assert plan[-1].renewed == 0
 
 
@@ -57,7 +57,7 @@ def test_the_papers_form_neither_tapers_nor_polishes() -> None:
 
 def test_iterations_in_parts_are_iterations_at_once() -> None:
     plan = steps(SETTINGS, 0.0, 0.5, 5)
-    once, parts = (HostEvolution([population()], plan, SETTINGS) for _ in range(2))
+    once, parts = (HostIterations([population()], plan, SETTINGS) for _ in range(2))
     assert not once.iterate(5)
     sizes = [len(parts.population()[0])]
     while parts.iterate(1):
@@ -71,9 +71,9 @@ def test_iterations_in_parts_are_iterations_at_once() -> None:
 def test_a_phase_without_progress_ends_early() -> None:
     settings = replace(SETTINGS, metres=(1e-6, 1e-6), radians=(1e-6, 1e-6), flips=0.0, renewed=0.0, patience=2)
     plan = steps(settings, 0.0, 0.5, 30)
-    assert len(evolved([population(settings)], plan, settings, CPU).history()[0]) < 30
+    assert len(iterated([population(settings)], plan, settings, CPU).history()[0]) < 30
     patient = replace(settings, schedule=None)
-    assert len(evolved([population(patient)], plan, patient, CPU).history()[0]) == 30
+    assert len(iterated([population(patient)], plan, patient, CPU).history()[0]) == 30
 
 
 def test_objects_side_by_side_end_as_each_alone() -> None:
