@@ -168,7 +168,11 @@ class Placements:
             support = scene.standing[step.destination]
             relative = inverse(self._goal.standing[step.destination].T_table_object) @ self._shown(step.item)
             poses = support.T_table_object @ support.stance.item.symmetries.transforms(np.pi / 8) @ relative
-        upright = poses[:, 2, :3] @ self._shown(step.item)[2, :3] > np.cos(ALIGNED)
+        shown = self._shown(step.item)
+        upright = poses[:, 2, :3] @ shown[2, :3] > np.cos(ALIGNED)
+        if step.region and not upright.any():
+            # What it goes beside lies otherwise than it was shown: the place still means something, its turn does not.
+            poses[:, :3, :3], upright[:] = shown[:3, :3], True
         kept = list(poses[upright])
         return kept[:: -(-len(kept) // RING)] if kept else [self._centred(step, scene)]
 
