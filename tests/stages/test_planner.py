@@ -489,7 +489,7 @@ def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
 
 def test_beside_what_lies_now_and_stood_when_it_was_shown_is_where_it_was_shown_to_be():
     goal = Layout().put("milk_carton", 0.12, -0.04, yaw=-2.0).put("sauce_bottle", 0.01, -0.12, yaw=0.3)
-    start = Layout().put("milk_carton", 0.02, 0.19, yaw=1.0, resting=1).put("sauce_bottle", -0.04, -0.23, resting=1)
+    start = Layout().put("milk_carton", 0.0, 0.0, yaw=1.0, resting=1).put("sauce_bottle", 0.0, -0.3, resting=1)
     found = plan(goal, start)
     assert [transfer.object for transfer in found.transfers] == ["sauce_bottle"]
     assert reached(goal, executed(start, found))
