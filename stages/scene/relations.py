@@ -71,10 +71,17 @@ def supports(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, 
 
 def gaps(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: Tolerances) -> dict[str, float]:
     """Objects that hang above what is said to carry them, and by how many metres: what really does was not seen."""
-    surfaces = {TABLE: 0.0} | {item.name: item.z_top for item in standing}
+    named = {item.name: item for item in standing}
     carriers = {item.arguments[0]: item.arguments[1] for item in found if item.predicate in ("on", "in")}
-    above = {item.name: item.z_bottom - surfaces[carriers[item.name]] for item in standing}
+    above = {item.name: item.z_bottom - _surface(named.get(carriers[item.name]), item) for item in standing}
     return {name: gap for name, gap in above.items() if gap > tolerances.contact}
+
+
+def _surface(carrier: Standing | None, item: Standing) -> float:
+    """Height above the table at which a carrier (None: the table) bears an object: at its floor where there is room."""
+    if carrier is None:
+        return 0.0
+    return carrier.rest_height(item.bottom) if regions.inside(item.bottom, carrier.floor) else carrier.z_top
 
 
 def _supporters(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, dict[str, float]]:
