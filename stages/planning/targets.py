@@ -231,7 +231,7 @@ class Targets:
             if any(_is_near(place, item, self._workspace.clearance) for item in later[:meanwhile]):
                 return False
             after = scene.after(step.item, place, step.destination)
-            room = all(self._goal_poses(child, after)[0] for child in children)
+            room = all(self._goal_poses(child, after, enough=1)[0] for child in children)
             return room and (crowds or not self._crowds(place, rest, scene))
 
         return [first, *filter(leads_on, others)]
@@ -243,7 +243,8 @@ class Targets:
         poses = tuple((item.name, item.T_table_stance.tobytes()) for item in scene.standing.values())
         key = (step, pending, frozenset(poses), again)
         if key not in self._known:
-            found, obstacles = self._goal_poses(step, scene) if final else self._free_spots(step, rest, scene)
+            enough = 2 * self._workspace.targets
+            found, obstacles = self._goal_poses(step, scene, enough) if final else self._free_spots(step, rest, scene)
             places = [placement.standing for placement in sorted(found, key=lambda placement: placement.cost)]
             places = (places[self._workspace.targets :] or places[len(places) // 2 :]) if again else places
             handled = self._handling.of(step, scene, places) if places else None
@@ -254,8 +255,11 @@ class Targets:
         pending = {after.item for after in rest} - {item.name}
         return any(_is_near(item, scene.standing[name], CROWDED) for name in pending)
 
-    def _goal_poses(self, step: Step, scene: Scene) -> Found:
-        """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle."""
+    def _goal_poses(self, step: Step, scene: Scene, enough: int) -> Found:
+        """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle.
+
+        As many places as are ``enough``, or all that there are.
+        """
         placements = self._placements.of(step, scene)
         placements = self._seen_first(placements, step, scene) if step.region else placements
         margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
@@ -263,7 +267,7 @@ class Targets:
             margins = margins[:2]
         found: Found = [], ()
         for margin in margins:
-            found = self._free(step, scene, placements, margin=margin)
+            found = self._free(step, scene, placements, margin=margin, enough=enough)
             if found[0]:
                 break
         return found
@@ -280,7 +284,9 @@ class Targets:
             sorted_again.append(Placement(one.standing, one.cost + hidden[place]))
         return sorted(sorted_again, key=lambda placement: placement.cost)
 
-    def _free(self, step: Step, scene: Scene, placements: Sequence[Placement], *, margin: float | None) -> Found:
+    def _free(
+        self, step: Step, scene: Scene, placements: Sequence[Placement], *, margin: float | None, enough: int
+    ) -> Found:
         """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
         others = scene.others(step.item, step.destination)
         valid: list[Placement] = []
@@ -306,7 +312,7 @@ class Targets:
                 beyond.append(Placement(item, placement.cost + BEYOND + outside))
                 continue
             valid.append(Placement(item, placement.cost))
-            if len(valid) == 2 * self._workspace.targets:
+            if len(valid) == enough:
                 break
         obstacles = min(blocking, key=lambda hit: _effort(hit, scene), default=())
         return valid + beyond[: self._workspace.targets], obstacles

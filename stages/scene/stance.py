@@ -45,10 +45,17 @@ class Cavity:
 
     def height(self, region: Region) -> float:
         """Height at which a flat bottom that covers ``region`` comes to rest: the highest floor point below it."""
-        xy = self.samples[:, :2]
-        near = self.samples[np.all((xy >= region.min(0)) & (xy <= region.max(0)), axis=1)]
+        xy = self._raised[:, :2]
+        near = self._raised[np.all((xy >= region.min(0)) & (xy <= region.max(0)), axis=1)]
+        if not len(near):
+            return self.floor
         below = regions.depth(region, near[:, :2]) >= 0
         return float(near[below, 2].max()) if below.any() else self.floor
+
+    @cached_property
+    def _raised(self) -> Floats:
+        """The samples that stand above the lowest: few of a tray."""
+        return self.samples[self.samples[:, 2] > self.floor + 1e-9]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ _FLAT = ("tea_box", "sugar_box", "cereal_box", "soup_can", "tuna_can", "sponge")
 """What carries others wherever it stands."""
 _SLOTS = [(x, y) for x in (-0.127, 0.0, 0.127) for y in (-0.065, 0.065)]
 """Metres in the tray's frame: with all of them taken the tray is full."""
+_ORDERED = 20
+"""Draws of a full tray after which its objects change places."""
 
 
 class Swap(Drawn):
@@ -19,6 +21,7 @@ class Swap(Drawn):
     def choose(self, rng: np.random.Generator) -> None:
         """The kind of exchange, and one or two objects beside it."""
         self._exchange = (self._circle, self._tower, self._tray)[rng.integers(3)]
+        self._goals = 0
         flat = rng.permutation(_FLAT).tolist()
         small = rng.permutation([name for name in graspable(self.catalogue) if name != "bowl"]).tolist()
         if self._exchange == self._tray:
@@ -37,25 +40,28 @@ class Swap(Drawn):
 
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """The exchange, one way round as goal and the other way round as start."""
-        self._exchange(kind, draft)
+        self._exchange(kind, draft, rng)
         for name in self._beside:
             put(draft, name)
 
-    def _circle(self, kind: Kind, draft: Draft) -> None:
+    def _circle(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """Each on the carrier of the next one."""
         for name in self._carriers:
             put(draft, name)
         for k, name in enumerate(self._parts):
             put(draft, name, self._carriers[(k + (kind == "start")) % len(self._carriers)])
 
-    def _tower(self, kind: Kind, draft: Draft) -> None:
+    def _tower(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         support = "table"
         for name in self._parts if kind == "goal" else self._parts[::-1]:
             put(draft, name, support)
             support = name
 
-    def _tray(self, kind: Kind, draft: Draft) -> None:
-        """Every slot taken, by the next object at the start."""
+    def _tray(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
+        """Every slot taken, by the next object at the start. Whether all are in sight is a matter of their order."""
+        self._goals += kind == "goal"
+        if kind == "goal" and self._goals > _ORDERED:
+            self._parts = rng.permutation(self._parts).tolist()
         put(draft, "tray")
         T = draft.placed["tray"].T_table_stance
         yaw = float(np.arctan2(T[1, 0], T[0, 0]))
