@@ -1,5 +1,7 @@
 """What may hide an object that is not seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,14 @@ def test_what_is_tall_and_wide_is_looked_behind_first() -> None:
     )
     assert hiders([stances("tuna_can")], seen, MOVABLE) == ["milk_carton"]
     assert hiders([stances("tuna_can")], seen, MOVABLE - {"milk_carton"}) == []
+
+
+def test_a_box_on_its_end_hides_a_can_in_the_strip_behind_it() -> None:
+    """The scene of seed 389 of the suite hidden: an object of 5 by 12 cm, and a can where only it hides anything."""
+    eye = np.array([0.088, -0.432, 0.686])
+    box = Layout().put("cereal_box", 0.009, 0.012, yaw=-0.273)
+    found = hiders([stances("tuna_can")], replace(scene(box, {"cereal_box": TABLE}), eye=eye), {"cereal_box"})
+    assert found == ["cereal_box"]
 
 
 def test_what_hangs_in_the_air_is_looked_under_first_and_a_stack_from_its_top() -> None:
