@@ -99,21 +99,21 @@ def separation(a: Region, b: Region) -> float:
     return max(_beyond(a, b), _beyond(b, a))
 
 
-def _edges(region: Region) -> NDArray[np.float64]:
+def edges(region: Region) -> NDArray[np.float64]:
     """From each corner to the next; as with ``np.roll``, which takes ten times as long."""
     return np.concatenate([region[1:], region[:1]]) - region
 
 
 def _beyond(region: Region, other: Region) -> float:
     """How far all of ``other`` lies beyond the edge of ``region`` that separates them best; negative if none does."""
-    along = _edges(region)
+    along = edges(region)
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
     return float(((outward @ other.T).min(1) - (outward * region).sum(1)).max())
 
 
 def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
     """Distance of N points to the nearest edge of a region, N."""
-    along = _edges(region)
+    along = edges(region)
     offset = corners[:, None] - region
     t = np.clip((offset * along).sum(2) / (along**2).sum(1), 0, 1)
     return np.linalg.norm(offset - t[..., None] * along, axis=2).min(1)
@@ -121,7 +121,7 @@ def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[n
 
 def depth(region: Region, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """How deep N points lie inside the region, metres, N: distance to the nearest edge line, negative outside."""
-    along = _edges(region)
+    along = edges(region)
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
     return (points @ inward.T - (region * inward).sum(1)).min(1)
 

@@ -40,28 +40,29 @@ class Swap(Drawn):
 
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """The exchange, one way round as goal and the other way round as start."""
-        self._exchange(kind, draft, rng)
+        self._goals += kind == "goal"
+        if kind == "goal" and self._exchange == self._tray and self._goals > _ORDERED:
+            # Whether all are in sight is a matter of their order.
+            self._parts = rng.permutation(self._parts).tolist()
+        self._exchange(kind, draft)
         for name in self._beside:
             put(draft, name)
 
-    def _circle(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
+    def _circle(self, kind: Kind, draft: Draft) -> None:
         """Each on the carrier of the next one."""
         for name in self._carriers:
             put(draft, name)
         for k, name in enumerate(self._parts):
             put(draft, name, self._carriers[(k + (kind == "start")) % len(self._carriers)])
 
-    def _tower(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
+    def _tower(self, kind: Kind, draft: Draft) -> None:
         support = "table"
         for name in self._parts if kind == "goal" else self._parts[::-1]:
             put(draft, name, support)
             support = name
 
-    def _tray(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
-        """Every slot taken, by the next object at the start. Whether all are in sight is a matter of their order."""
-        self._goals += kind == "goal"
-        if kind == "goal" and self._goals > _ORDERED:
-            self._parts = rng.permutation(self._parts).tolist()
+    def _tray(self, kind: Kind, draft: Draft) -> None:
+        """Every slot taken, by the next object at the start."""
         put(draft, "tray")
         T = draft.placed["tray"].T_table_stance
         yaw = float(np.arctan2(T[1, 0], T[0, 0]))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.scene.stance import Standing
 
@@ -30,7 +31,7 @@ def _behind(points: Floats, other: Standing, eye: Floats) -> np.ndarray[tuple[in
 
     Each side of the prism bounds the part of a line, from 0 at the eye to 1 at the point, that is inside it.
     """
-    along = np.roll(other.outline, -1, axis=0) - other.outline
+    along = regions.edges(other.outline)
     outward = np.column_stack([along[:, 1], -along[:, 0], np.zeros(len(along))])
     normals = np.vstack([outward, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     limits = np.append((outward[:, :2] * other.outline).sum(1), [other.z_top, -other.z_bottom])
