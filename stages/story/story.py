@@ -261,7 +261,7 @@ class Story:
             self._job = None  # it was a look, no more
 
     def _end(self, end: Goal | Verdict, id: str) -> None:
-        if isinstance(end, Goal):
+        if isinstance(end, Goal) and self._folder is None:  # else Kept says so, which may be heard before this goal
             self._goals[end.name] = Remembered(end, self._photo)
         self._ended, self._job = (end, id), None
 

@@ -323,6 +323,14 @@ def test_a_goal_that_is_kept_can_be_edited_and_carried_away(tmp_path: Path) -> N
     assert listener.told().cards == ()
 
 
+def test_a_goal_may_be_recorded_after_it_was_kept(tmp_path: Path) -> None:
+    listener = Listener(goals={"folder": tmp_path})
+    goal = Goal(name="tea", scene=GOAL, pddl="")
+    listener.hear(Kept(goals=(goal,)), goal)
+    (card,) = listener.told().cards
+    assert card.file is not None and card.lines
+
+
 def test_what_is_on_disk_is_told_without_a_run(tmp_path: Path) -> None:
     GoalFolder(tmp_path).write(Goal(name="tea", scene=GOAL, pddl=""))
     listener = Listener(goals={"folder": tmp_path})
