@@ -18,6 +18,7 @@ if not hasattr(np, "infty"):
     np.infty = np.inf
 
 import pyrender
+import trimesh
 from pyrender.constants import RenderFlags
 from scipy.spatial import KDTree
 
@@ -209,7 +210,8 @@ def _shaded(mesh: Mesh) -> Any:
     positions, colors = mesh.vertices[corners], (mesh.colors[corners] / 255.0) ** _GAMMA
     rows = np.concatenate([positions, crease_normals(mesh), colors], axis=1).astype(np.float32)
     # Corners that agree in everything share a vertex again, which saves most of the work of drawing.
-    vertices, indices = np.unique(rows.round(6), axis=0, return_inverse=True)
+    first, indices = trimesh.grouping.unique_rows(rows, digits=6)
+    vertices = rows[first].round(6)
     primitive = pyrender.Primitive(
         positions=vertices[:, :3],
         normals=vertices[:, 3:6],
