@@ -18,7 +18,7 @@ from stages.messages import Brake, LookRequest, RobotCommand, RobotState, Sensor
 from stages.robots import Robot
 from stages.scene.catalogue import Catalogue
 
-_LOOK = 4.0
+_LOOK = 4
 """Seconds that pass for others while the robot looks and thinks."""
 
 
@@ -42,7 +42,8 @@ class SimulatedRobot(Stage):
 
     def on_look_request(self, look_request: LookRequest, ctx: Context) -> Snapshot:
         """The world as it is now, for the simulated camera."""
-        self._meddle(_LOOK, ctx)
+        for _ in range(_LOOK):
+            self._meddle(1.0, ctx)
         rng = np.random.default_rng([self._seed, 3, self._looks])
         self._looks += 1
         return self.snapshot(look_request.purpose, self._wrong.at_a_look(rng))

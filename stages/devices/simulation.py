@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -90,6 +91,7 @@ class Simulation:
         joint = self._data.joint(name)
         joint.qpos[:] = np.concatenate([T_base_object[:3, 3] + [0, 0, _DROP], quaternion(T_base_object[:3, :3])])
         joint.qvel[:] = 0
+        self._awake(mujoco.mj_kinematics)
 
     def _put_away(self, name: str) -> None:
         """Each to a place of its own."""
@@ -108,11 +110,14 @@ class Simulation:
 
     def touching(self, name: str) -> set[str]:
         """Names of the bodies that an object touches: links of the robot, ``table``, other objects."""
-        # What sleeps has no contacts.
-        self._model.opt.enableflags &= ~_SLEEP
-        mujoco.mj_forward(self._model, self._data)
-        self._model.opt.enableflags |= _SLEEP
+        self._awake(mujoco.mj_forward)
         return self._touched(name)
+
+    def _awake(self, compute: Callable[[Any, Any], None]) -> None:
+        """Computes for what sleeps, too, which else has no contacts and is where it was."""
+        self._model.opt.enableflags &= ~_SLEEP
+        compute(self._model, self._data)
+        self._model.opt.enableflags |= _SLEEP
 
     def _touched(self, name: str) -> set[str]:
         """The same, as far as contacts are known."""

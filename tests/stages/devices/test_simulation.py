@@ -35,6 +35,16 @@ def test_what_stood_on_what_is_taken_away_falls() -> None:
     assert simulation.layout()["soup_can"][2, 3] < high - 0.05
 
 
+def test_what_is_put_down_is_there_at_once() -> None:
+    simulation = stacked()
+    T = standing("soup_can", 0.7, 0.2)
+    simulation.add("soup_can", T)
+    assert np.allclose(simulation.layout()["soup_can"], T, atol=0.003)
+    simulation.remove("soup_can")
+    simulation.add("soup_can", T)
+    assert np.allclose(simulation.layout()["soup_can"], T, atol=0.003)
+
+
 def test_what_is_at_rest_still_touches() -> None:
     simulation = stacked()
     assert simulation.touching("soup_can") == {"tea_box"}
