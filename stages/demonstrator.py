@@ -307,10 +307,13 @@ class Demonstrator(Stage):
             self._state = replace(state, phase=Phase.ASKING, question=question, shown=shown, asked=question.number)
             yield question
             return
-        if state.goal is not None and not state.known:
-            scene_graph = self._exchanged(scene_graph, state.goal)
-        scene = self._memory.complete(scene_graph, self._state.known, observation)
-        seen, ahead = self._state.seen | _names(scene_graph), self._state.views[1:]
+        scene_graph = self._memory.named(scene_graph, state.known)
+        scene = self._memory.complete(scene_graph, state.known, observation)
+        seen, ahead = state.seen | _names(scene_graph), state.views[1:]
+        if state.goal is not None and (not state.known or _spares(scene, state.goal)):
+            names = self._exchanged(scene, state.goal)
+            seen = frozenset(names.get(name, name) for name in seen)
+            scene = self._memory.renamed(scene, [names[item.name] for item in scene.objects])
         self._state = replace(
             self._state,
             known={item.name: item for item in scene.objects},
@@ -492,15 +495,16 @@ class Demonstrator(Stage):
         placed = msgspec.structs.replace(known[outcome.object], T_base_object=outcome.T_base_object)
         return {**known, outcome.object: placed}
 
-    def _exchanged(self, scene: SceneGraph, goal: SceneGraph) -> SceneGraph:
-        """Equal objects with the names with which most of the goal holds already; which of them is which is no matter,
-        unless somebody is there who is asked."""
-        if self._state.ask and which(scene, goal):
-            return scene
+    def _exchanged(self, scene: SceneGraph, goal: SceneGraph) -> dict[str, str]:
+        """The names of equal objects (old: new) with which most of the goal holds already; which of them is which is no
+        matter, unless somebody is there who is asked."""
         labels, names = [item.label for item in scene.objects], [item.name for item in scene.objects]
-        ways = islice(exchanges(labels, names, {item.name: item.label for item in goal.objects}), _EXCHANGES)
-        scenes = [scene, *(self._memory.renamed(scene, way) for way in ways)]
-        return max(scenes, key=lambda one: len(satisfied(goal, one, self._catalogue)[0]))
+        ways = [names]
+        if not (self._state.ask and which(scene, goal)):
+            wanted = {item.name: item.label for item in goal.objects}
+            ways += islice(exchanges(labels, names, wanted), _EXCHANGES)
+        held = [len(satisfied(goal, self._memory.renamed(scene, way), self._catalogue)[0]) for way in ways]
+        return dict(zip(names, ways[held.index(max(held))], strict=True))
 
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""
@@ -682,6 +686,12 @@ class AskedDemonstrator(KeepingDemonstrator):
 
 def _names(scene: SceneGraph) -> set[str]:
     return {item.name for item in scene.objects}
+
+
+def _spares(scene: SceneGraph, goal: SceneGraph) -> bool:
+    """Whether the goal lacks an object while there is an equal one that it does not name."""
+    lost = {item.label for item in goal.objects if item.name not in _names(scene)}
+    return any(item.label in lost and item.name not in _names(goal) for item in scene.objects)
 
 
 def change_of_plan(expected: Sequence[Transfer], planned: Sequence[Transfer]) -> str:

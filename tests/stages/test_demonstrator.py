@@ -638,17 +638,33 @@ def test_a_doubt_is_settled_for_the_whole_task_and_asked_about_only_where_somebo
     assert isinstance(episode.seen(doubtful(START, UNKNOWN))[0], Task)
 
 
+CARTON_AND_CUP = Layout().put("milk_carton", 0.0, 0.0).put("cup", 0.1, 0.2).poses
+
+
+def with_a_second_cup(*names: str) -> SceneGraph:
+    """Of a carton and a cup those with these ``names``, and another cup."""
+    poses = {name: CARTON_AND_CUP[name] for name in names}
+    graph = Layout({**poses, "cup_2": upright("cup", -0.1, -0.2, 0.0)}).graph()
+    labelled = (msgspec.structs.replace(one, label="cup") if one.name == "cup_2" else one for one in graph.objects)
+    return msgspec.structs.replace(graph, objects=tuple(labelled))
+
+
+def test_where_an_equal_object_is_left_the_goal_lacks_nothing() -> None:
+    """The cup that was called so was a mistake, and is not seen again."""
+    episode, goal = Episode(), Layout().put("milk_carton", 0.0, 0.0).put("cup", 0.0, 0.0, on="milk_carton").graph()
+    task = episode.until_task(goal, with_a_second_cup("milk_carton", "cup"))
+    assert [one.name for one in task.current.objects] == ["milk_carton", "cup", "cup_2"]
+    episode.planned(STEP)
+    episode.ended(1, STEP)
+    (task,) = episode.seen(with_a_second_cup("milk_carton"))
+    assert isinstance(task, Task) and [one.name for one in task.current.objects] == ["milk_carton", "cup"]
+
+
 def test_of_two_cups_the_person_says_which_is_meant() -> None:
-    two = Layout().put("milk_carton", 0.0, 0.0).put("cup", 0.1, 0.2)
-    extra = Layout({**two.poses, "cup_2": upright("cup", -0.1, -0.2, 0.0)})
-    graph = extra.graph()
-    labelled = tuple(
-        msgspec.structs.replace(item, label="cup") if item.name == "cup_2" else item for item in graph.objects
-    )
-    graph = msgspec.structs.replace(graph, objects=labelled)
+    graph = with_a_second_cup("milk_carton", "cup")
     episode = Episode(scripted=False)
     episode.called(Teach(name="tea"))
-    episode.seen(two.graph())
+    episode.seen(Layout(CARTON_AND_CUP).graph())
     episode.called(Restore(name="tea", ask=True))
     (question,) = episode.seen(graph)
     assert isinstance(question, Question)

@@ -45,7 +45,6 @@ class Memory:
         """
         if observation.T_base_camera is None:
             return scene
-        scene = self._named(scene, known)
         seen = {item.name for item in scene.objects}
         missing = [item for name, item in known.items() if name not in seen]
         strangers = [item for item in scene.objects if item.name not in known]
@@ -62,15 +61,17 @@ class Memory:
             return scene
         return self.related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
 
-    def _named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
+    def named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
         """Equal objects with the names of those that are known where they stand: who moved one knows where it went."""
         labels = [item.label for item in scene.objects]
-        equal = {label for label in labels if labels.count(label) > 1}
-        if not equal or not known:
+        sure = [labels.count(item.label) == 1 and item.name in known for item in scene.objects]
+        if all(sure) or not known:
             return scene
         before = {name: Named(item.label, item.T_base_object[:3, 3]) for name, item in known.items()}
         kept = names_kept(labels, np.stack([item.T_base_object[:3, 3] for item in scene.objects]), before)
-        kept = [name if item.label in equal else item.name for item, name in zip(scene.objects, kept, strict=True)]
+        for i, item in enumerate(scene.objects):
+            if sure[i] or (kept[i] is None and labels.count(item.label) == 1):
+                kept[i] = item.name
         return self.renamed(scene, unique_names(labels, kept))
 
     def renamed(self, scene: SceneGraph, names: Sequence[str]) -> SceneGraph:

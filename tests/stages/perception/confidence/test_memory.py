@@ -39,7 +39,8 @@ def observation(placed: dict[str, Floats]) -> Observation:
 
 def completed(seen: dict[str, Floats], before: dict[str, Floats], true: dict[str, Floats]) -> SceneGraph:
     """The scene that shows ``seen`` of what is truly there, to somebody who knew of ``before``."""
-    return MEMORY.complete(graph(seen), known(before), observation(true))
+    remembered = known(before)
+    return MEMORY.complete(MEMORY.named(graph(seen), remembered), remembered, observation(true))
 
 
 def names(scene: SceneGraph) -> list[str]:
@@ -120,6 +121,12 @@ def test_regions_of_what_is_seen_stay() -> None:
     scene = completed(seen, pair, pair)
     assert {item.name for item in scene.virtual_objects} == {item.name for item in graph(seen).virtual_objects} != set()
     assert {text for text in asserted(graph(seen)) if "_near_" in text} <= asserted(scene)
+
+
+def test_the_only_one_of_its_kind_keeps_the_name_that_is_known_where_it_stands() -> None:
+    here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
+    for seen, expected in ((here, "sponge"), (there, "sponge_2")):
+        assert names(MEMORY.named(graph({"sponge_2": seen}), known({"sponge": here}))) == [expected]
 
 
 def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
