@@ -92,6 +92,7 @@ class SceneGraphBuilder(Stage):
                 T_base_object=T_base_camera @ item.T_camera_object,
                 facing=1.0 if len(self._catalogue[item.label].symmetries.transforms()) == 1 else item.facing,
                 visible=item.visible,
+                probability=item.probability,
             )
             for item in found
         )

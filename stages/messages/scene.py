@@ -100,6 +100,8 @@ class SceneObject(Struct, frozen=True, kw_only=True):
     has no symmetry; None where nobody looked."""
     visible: float = 1.0
     """Share of its silhouette that nothing hid when it was seen last."""
+    probability: float | None = None
+    """That the pose is right, as :attr:`ObjectPose.probability`."""
 
 
 class Doubt(Struct, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""What is remembered of a scene: what is not seen stays where it was last seen or placed."""
+"""What is remembered of a scene: what is not seen, or hardly, stays where it was last seen or placed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,15 @@ from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue
 from stages.scene.naming import Named, names_kept, unique_names
-from stages.scene.stance import Stances, standing_of
+from stages.scene.stance import TIPPED, Stances, standing_of, turned
+from stages.scene.text import SURE
 
 _TRIANGLES = 500
 _CLEARER = 2.0
 """How many times as much must show of what is seen now as showed of what was seen before in its place."""
+_SAME = 0.02
+"""Metres within which a doubtful pose and a sure one from before may be one: as far off as a pose is that counts as
+right."""
 _CONTENT = 0.5
 """Share of a container's footprint up to which something may stand in it."""
 
@@ -38,7 +42,7 @@ class Memory:
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def complete(self, scene: SceneGraph, known: Mapping[str, SceneObject], observation: Observation) -> SceneGraph:
-        """The scene with those ``known`` objects that it lacks and that may still be where they were.
+        """The scene with those ``known`` objects that it lacks, or doubts, and that may still be where they were.
 
         A stranger at such an object's place is the object, taken for something else because little of it shows; but
         where twice as much shows of the stranger, the object had been the mistake.
@@ -57,9 +61,23 @@ class Memory:
             if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
                 taken |= false
-        if not kept:
+        surer = {item.name: self._surer(item, known.get(item.name), scene, observation) for item in scene.objects}
+        if not kept and all(surer[item.name] is item for item in scene.objects):
             return scene
-        return self.related(scene, (*(item for item in scene.objects if item.name not in taken), *kept))
+        return self.related(scene, (*(surer[item.name] for item in scene.objects if item.name not in taken), *kept))
+
+    def _surer(
+        self, item: SceneObject, before: SceneObject | None, scene: SceneGraph, observation: Observation
+    ) -> SceneObject:
+        """What something before a mug hides is mostly its handle: who saw that before knows better how it stands."""
+        if before is None or before.probability is None or item.probability is None:
+            return item
+        apart = np.linalg.norm(item.T_base_object[:3, 3] - before.T_base_object[:3, 3])
+        tipped = turned(self._catalogue[item.label], item.T_base_object, before.T_base_object) > TIPPED
+        if not item.probability < SURE <= before.probability or apart > _SAME or tipped:
+            return item
+        others = [other for other in scene.objects if other.name != item.name]
+        return item if self._seen_empty(before, others, observation) else before
 
     def named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
         """Equal objects with the names of those that are known where they stand: who moved one knows where it went."""

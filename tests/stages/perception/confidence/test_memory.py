@@ -2,6 +2,7 @@
 
 import msgspec
 import numpy as np
+import pytest
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
@@ -127,6 +128,19 @@ def test_the_only_one_of_its_kind_keeps_the_name_that_is_known_where_it_stands()
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
     for seen, expected in ((here, "sponge"), (there, "sponge_2")):
         assert names(MEMORY.named(graph({"sponge_2": seen}), known({"sponge": here}))) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("probability", "off", "kept"), [(0.6, 0.01, True), (0.95, 0.01, False), (0.6, 0.03, False), (None, 0.01, False)]
+)
+def test_a_doubtful_pose_gives_way_to_a_sure_one_of_before(probability: float | None, off: float, kept: bool) -> None:
+    """A mug whose handle is hidden now."""
+    true, doubted = upright("mug", 0.1, 0.1, 0.0), upright("mug", 0.1 + off, 0.1, 0.5)
+    doubtful = msgspec.structs.replace(known({"mug": doubted})["mug"], probability=probability)
+    sure = msgspec.structs.replace(known({"mug": true})["mug"], probability=0.99)
+    seen = msgspec.structs.replace(graph({"mug": doubted}), objects=(doubtful,))
+    (mug,) = MEMORY.complete(seen, {"mug": sure}, observation({"mug": true})).objects
+    np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ (true if kept else doubted), atol=1e-9)
 
 
 def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
