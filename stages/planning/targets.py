@@ -41,7 +41,7 @@ FARTHER = 0.03
 """Metres beyond the robot's reach within which something may be placed if the hand gets there."""
 FEWEST = 4
 """Poses offered for a transfer of which only late ones are within reach."""
-BRANCHES, TRIES = 4, 40
+BRANCHES, TRIES = 4, 80
 """Places of one step from which is gone on, and how many in all before each step has but one."""
 
 BEYOND = 1.0
@@ -106,11 +106,13 @@ class Blocked:
     obstacles: tuple[str, ...]
     why: str = ""
     """What the hand fails at where there is room for the object."""
+    crowding: frozenset[str] = frozenset()
+    """Objects that take up other places of the step, or of those before it that it was tried after in vain."""
 
     @property
-    def involved(self) -> set[str]:
+    def involved(self) -> frozenset[str]:
         """Whatever might let the step succeed if it stood elsewhere."""
-        return {self.step.item, self.step.destination, self.step.parent, *self.obstacles}
+        return self.crowding.union({self.step.item, self.step.destination, self.step.parent}, self.obstacles)
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,8 @@ class Next:
     """As it is after the step, at the first of the targets."""
 
 
-Found = tuple[list[Placement], tuple[str, ...]]
-"""Places that are free, best first, and the fewest objects that take up another one."""
+Found = tuple[list[Placement], Sequence[tuple[str, ...]]]
+"""Places that are free, best first, and the objects that take up each of the others."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +142,8 @@ class Options:
 
     places: list[Standing]
     handled: Handled
-    obstacles: tuple[str, ...]
-    """The fewest objects that take up another place."""
+    blocked: Blocked
+    """What the step would be without these places."""
 
 
 class Targets:
@@ -244,11 +246,13 @@ class Targets:
         key = (step, pending, frozenset(poses), again)
         if key not in self._known:
             enough = 2 * self._workspace.targets
-            found, obstacles = self._goal_poses(step, scene, enough) if final else self._free_spots(step, rest, scene)
+            found, taken = self._goal_poses(step, scene, enough) if final else self._free_spots(step, rest, scene)
+            obstacles = min(taken, key=lambda names: _effort(names, scene), default=())
+            blocked = Blocked(step, obstacles, crowding=frozenset().union(*taken))
             places = [placement.standing for placement in sorted(found, key=lambda placement: placement.cost)]
             places = (places[self._workspace.targets :] or places[len(places) // 2 :]) if again else places
             handled = self._handling.of(step, scene, places) if places else None
-            self._known[key] = Options(places, handled, obstacles) if handled else Blocked(step, obstacles)
+            self._known[key] = Options(places, handled, blocked) if handled else blocked
         return self._known[key]
 
     def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
@@ -314,8 +318,7 @@ class Targets:
             valid.append(Placement(item, placement.cost))
             if len(valid) == enough:
                 break
-        obstacles = min(blocking, key=lambda hit: _effort(hit, scene), default=())
-        return valid + beyond[: self._workspace.targets], obstacles
+        return valid + beyond[: self._workspace.targets], blocking
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
         """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
@@ -380,12 +383,15 @@ def _trouble(step: Step, options: Options, failed: Blocked | Crowded | None) -> 
 
     Where that is without any room, the step itself is blocked by what takes up other places of it.
     """
+    blocked = options.blocked
     if failed is None:
         why, obstacles = options.handled.why_not()
-        return Blocked(step, obstacles or options.obstacles, why)
-    if isinstance(failed, Blocked) and not failed.obstacles and step.item in failed.involved and options.obstacles:
-        return Blocked(step, options.obstacles)
-    return failed
+        return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why)
+    if isinstance(failed, Crowded) or step.item not in failed.involved:
+        return failed
+    if not failed.obstacles and blocked.obstacles:
+        return blocked
+    return replace(failed, crowding=failed.crowding | blocked.crowding)
 
 
 def _fits(item: Standing, carrier: Standing) -> bool:
