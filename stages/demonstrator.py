@@ -56,6 +56,7 @@ from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
 from stages.scene.relations import Tolerances, gaps
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
+from stages.scene.text import UNSURE
 from stages.scene.virtual import satisfied, without
 
 _EXCHANGES = 200
@@ -239,7 +240,7 @@ class Demonstrator(Stage):
         self._state = replace(self._state, waits="paused")
         ctx.log("pauses before the next transfer")
 
-    def on_go(self, go: Go, ctx: Context) -> TransferRequest | LookRequest | Verdict | None:
+    def on_go(self, go: Go, ctx: Context) -> TransferRequest | LookRequest | Task | Verdict | None:
         """Carries out the plan that waits; after a pause, in which people move things, only after another look."""
         state = self._state
         if not state.waits:
@@ -336,6 +337,8 @@ class Demonstrator(Stage):
         missing = self._missing(scene)
         if missing:
             yield self._look_for(missing, scene, ctx)
+        elif self._state.goal is None and (doubtful := self._doubtful(scene)):
+            yield self._look_again("perception", f"in doubt: {', '.join(doubtful)}", ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
         else:
@@ -518,6 +521,12 @@ class Demonstrator(Stage):
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 
+    def _doubtful(self, scene: SceneGraph) -> list[str]:
+        """Objects whose pose is probably wrong, while there is a look left to see them better."""
+        if self._state.repeats == self._config.repeats:
+            return []
+        return [item.name for item in scene.objects if item.probability is not None and item.probability < UNSURE]
+
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
         ctx.log(f'goal "{name}" remembered: {len(scene.objects)} objects, {len(scene.assertions)} assertions')
@@ -591,10 +600,14 @@ class Demonstrator(Stage):
         self._state = replace(self._state, phase=Phase.READY, plan=plan)
         ctx.log(f"waits for go: {', '.join(transfer.key for transfer in plan.transfers)}")
 
-    def _proceed(self, plan: Plan, ctx: Context) -> TransferRequest | Verdict:
-        """Requests the first transfer of a solved plan, unless plans have been replaced too often."""
+    def _proceed(self, plan: Plan, ctx: Context) -> TransferRequest | LookRequest | Task | Verdict:
+        """Requests the first transfer of a solved plan, unless plans have been replaced too often; what is in doubt is
+        looked at a second time before it is moved."""
         state = self._state
         assert state.scene is not None  # A plan answers a task, and a task holds a scene.
+        moved = plan.transfers[0].object
+        if state.repeats == 0 and not state.missing and moved in self._doubtful(state.scene):
+            return self._look_again("perception", f"in doubt before it is moved: {moved}", ctx)
         change = "new" if state.plans == 1 or state.missing else change_of_plan(state.remainder, plan.transfers)
         steps = ", ".join(f"{transfer.object} to {transfer.destination}" for transfer in plan.transfers)
         ctx.log(f"plan {state.plans} ({change}): {steps}")

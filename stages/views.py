@@ -70,7 +70,7 @@ from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue, Mesh
 from stages.scene.naming import region_name
 from stages.scene.relations import TABLE
-from stages.scene.text import SURE, support
+from stages.scene.text import SURE, UNSURE, support
 
 if TYPE_CHECKING:  # only an export speaks with ROS 2
     from runner.view.ros2_bag import BagMessage
@@ -87,8 +87,6 @@ NODE_SPACING = (130.0, 110.0)
 GHOST_TRIANGLES = 80
 _NO_ROBOTS_TABLE = (0.8, 0.0, 0.7)
 """Where the middle of the table is taken to be in graphs that name no robot, metres."""
-UNSURE = 0.5
-"""Probability below which an object is drawn in red."""
 _GREY: Color = (128, 128, 128)
 _BLUE: Color = (86, 156, 214)
 _GREEN: Color = (106, 190, 120)

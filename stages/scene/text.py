@@ -5,8 +5,8 @@ from __future__ import annotations
 from stages.messages import SceneEstimate, SceneGraph
 from stages.scene.relations import TABLE
 
-SURE = 0.9
-"""Probability from which an object's pose is called sure."""
+SURE, UNSURE = 0.9, 0.5
+"""Probabilities from which what is said of an object is called sure, and below which it is called doubtful."""
 
 
 def certainty(estimate: SceneEstimate) -> str:

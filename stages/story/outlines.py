@@ -12,13 +12,11 @@ from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import UnknownRegion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
 from stages.scene.naming import region_name
-from stages.scene.text import SURE
+from stages.scene.text import SURE, UNSURE
 from stages.story.words import Words
 
 TRIANGLES = 400
 """Of an object, for its edge."""
-UNSURE = 0.5
-"""Probability below which an object is called doubtful."""
 MARGIN = 0.2
 """Metres of ground about the objects, where nobody knows how far it goes."""
 COARSE_PIXELS = 1.0

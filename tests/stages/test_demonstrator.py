@@ -641,6 +641,37 @@ def test_a_doubt_is_settled_for_the_whole_task_and_asked_about_only_where_somebo
 CARTON_AND_CUP = Layout().put("milk_carton", 0.0, 0.0).put("cup", 0.1, 0.2).poses
 
 
+def judged(graph: SceneGraph, probability: float) -> SceneGraph:
+    objects = tuple(msgspec.structs.replace(one, probability=probability) for one in graph.objects)
+    return msgspec.structs.replace(graph, objects=objects)
+
+
+def test_a_goal_that_is_in_doubt_is_looked_at_again_before_it_is_remembered() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    (again,) = episode.seen(judged(GOAL, 0.2))
+    assert again == LookRequest(purpose="goal tea, look 2")
+    assert any("in doubt: milk_carton" in line or "in doubt: tray" in line for line in episode.ctx.lines)
+    (goal,) = episode.seen(judged(GOAL, 0.99))
+    assert isinstance(goal, Goal)
+    episode.called(Teach(name="tea"))
+    episode.seen(judged(GOAL, 0.2))
+    episode.seen(judged(GOAL, 0.2))
+    (goal,) = episode.seen(judged(GOAL, 0.2))
+    assert isinstance(goal, Goal)  # with what there is, after as many looks as are taken
+
+
+def test_what_is_in_doubt_is_looked_at_a_second_time_before_it_is_moved() -> None:
+    episode = Episode()
+    episode.until_task(start=judged(START, 0.3))
+    (again,) = episode.planned(STEP)
+    assert again == LookRequest(purpose="start, look 2")
+    (task,) = episode.seen(judged(START, 0.3))
+    assert isinstance(task, Task)
+    (request,) = episode.planned(STEP)
+    assert isinstance(request, TransferRequest) and request.number == 1
+
+
 def with_a_second_cup(*names: str) -> SceneGraph:
     """Of a carton and a cup those with these ``names``, and another cup."""
     poses = {name: CARTON_AND_CUP[name] for name in names}
