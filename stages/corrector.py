@@ -29,8 +29,11 @@ _CANDIDATES = 20
 """Postures among which the most telling ones are chosen."""
 _FEWEST = 2
 """Postures without which nothing is said of the camera."""
+_SURVEYS = 2
+"""Further looks at what is in the way, from which other postures are chosen where too few were reached."""
 _MORE_WAYS = 2
 """Ways home that are tried where none was found or one was barred: an arm in view hides what is to be seen."""
+_SURVEY = f"{OWN_ARM}: what is in the way"
 _HAND_CAMERA = (
     "the camera is in the hand and does not see how it is held: its pose in the hand has to be measured with a board"
 )
@@ -68,6 +71,8 @@ class State:
     """Those of the depth camera."""
     sights: tuple[Sight, ...] = ()
     robot_seconds: float = 0.0
+    surveys: int = 0
+    """Times that what is in the way was looked at again."""
     correction: Correction | None = None
     """That of the looks."""
 
@@ -150,7 +155,7 @@ class Corrector(Stage):
         if self._robot.camera_in_hand:
             yield from self._given_up(_HAND_CAMERA, ctx)
         else:
-            yield LookRequest(purpose=f"{OWN_ARM}: what is in the way")
+            yield LookRequest(purpose=_SURVEY)
 
     def on_frame(self, frame: Frame, ctx: Context) -> Iterator[Frame | PostureRequest | LookRequest | Correction]:
         """Corrects a look that somebody asked for, and takes those at the arm."""
@@ -284,7 +289,13 @@ class Corrector(Stage):
     def _concluded(self, ctx: Context) -> Iterator[LookRequest | Correction]:
         state = self._state
         if len(state.sights) < _FEWEST:
-            yield from self._given_up(f"the arm could show itself in {len(state.sights)} postures only", ctx)
+            few = f"the arm could show itself in {len(state.sights)} postures only"
+            if state.view is None or state.surveys == _SURVEYS:
+                yield from self._given_up(few, ctx)
+                return
+            ctx.log(f"{few}; looks again at what is in the way", level="warning")
+            self._state = replace(state, phase=Phase.SURVEYING, surveys=state.surveys + 1)
+            yield LookRequest(purpose=_SURVEY)
             return
         assert state.pixels is not None
         fit = Registration(self._surface, state.pixels, self._config.prior).fit(state.sights)

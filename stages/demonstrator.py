@@ -56,7 +56,7 @@ from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
 from stages.scene.relations import Tolerances, gaps
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
-from stages.scene.text import UNSURE
+from stages.scene.text import SURE, UNSURE
 from stages.scene.virtual import satisfied, without
 
 _EXCHANGES = 200
@@ -337,7 +337,7 @@ class Demonstrator(Stage):
         missing = self._missing(scene)
         if missing:
             yield self._look_for(missing, scene, ctx)
-        elif self._state.goal is None and (doubtful := self._doubtful(scene)):
+        elif self._state.goal is None and (doubtful := self._doubtful(scene, SURE)):
             yield self._look_again("perception", f"in doubt: {', '.join(doubtful)}", ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
@@ -521,11 +521,11 @@ class Demonstrator(Stage):
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 
-    def _doubtful(self, scene: SceneGraph) -> list[str]:
-        """Objects whose pose is probably wrong, while there is a look left to see them better."""
+    def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
+        """Objects whose pose is less probable than that, while there is a look left to see them better."""
         if self._state.repeats == self._config.repeats:
             return []
-        return [item.name for item in scene.objects if item.probability is not None and item.probability < UNSURE]
+        return [item.name for item in scene.objects if item.probability is not None and item.probability < least]
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
@@ -606,7 +606,7 @@ class Demonstrator(Stage):
         state = self._state
         assert state.scene is not None  # A plan answers a task, and a task holds a scene.
         moved = plan.transfers[0].object
-        if state.repeats == 0 and not state.missing and moved in self._doubtful(state.scene):
+        if state.repeats == 0 and not state.missing and moved in self._doubtful(state.scene, UNSURE):
             return self._look_again("perception", f"in doubt before it is moved: {moved}", ctx)
         change = "new" if state.plans == 1 or state.missing else change_of_plan(state.remainder, plan.transfers)
         steps = ", ".join(f"{transfer.object} to {transfer.destination}" for transfer in plan.transfers)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from stages.robots import BUILT_IN, Robot, read_robot
 HAND_CAMERA = BUILT_IN.with_name("ur5e_hand.yaml")
 CTX = Quiet()
 LOOK = LookRequest(purpose="goal")
+SURVEY = LookRequest(purpose="own arm: what is in the way")
 
 
 def frame(*, T_base_camera: Floats | None = None) -> Frame:
@@ -117,7 +120,7 @@ def table(robot: Robot) -> Frame:
 def test_a_camera_of_which_nobody_knows_where_it_stands_is_taken_as_it_is() -> None:
     corrector = Corrector(Corrector.Config())
     (survey,) = corrector.on_look_request(LOOK, CTX)
-    assert survey == LookRequest(purpose="own arm: what is in the way")
+    assert survey == SURVEY
     said, passed = corrector.on_frame(frame(), CTX)
     assert isinstance(said, Correction) and said.reason == "nobody knows where the camera stands to the robot"
     assert passed == LOOK
@@ -136,14 +139,16 @@ def arrived(*, success: bool = True, stopped: Stopped = "") -> Arrived:
     )
 
 
+AHEAD = tuple(
+    PostureRequest(joint_names=(), positions=np.zeros(0), table_height=0.0, occupied=np.zeros((0, 6)), label=label)
+    for label in ("second", "home")
+)
+
+
 def under_way() -> Corrector:
     """On the way to the first of two postures."""
     corrector = Corrector(Corrector.Config())
-    ahead = tuple(
-        PostureRequest(joint_names=(), positions=np.zeros(0), table_height=0.0, occupied=np.zeros((0, 6)), label=label)
-        for label in ("second", "home")
-    )
-    corrector._state = State(phase=Phase.MOVING, asked=LOOK, ahead=ahead)  # pyright: ignore[reportPrivateUsage]
+    corrector._state = State(phase=Phase.MOVING, asked=LOOK, ahead=AHEAD)  # pyright: ignore[reportPrivateUsage]
     return corrector
 
 
@@ -153,18 +158,26 @@ def test_a_posture_that_is_not_reached_is_left_out_and_too_few_say_nothing() -> 
     assert isinstance(second, PostureRequest) and second.label == "second"
     (home,) = corrector.on_arrived(arrived(success=False), CTX)
     assert isinstance(home, PostureRequest) and home.label == "home"
-    said, passed = corrector.on_arrived(arrived(), CTX)
-    assert isinstance(said, Correction) and said.reason == "the arm could show itself in 0 postures only"
-    assert said.robot_seconds == 6.0 and passed == LOOK
+    (survey,) = corrector.on_arrived(arrived(), CTX)
+    assert survey == SURVEY, "from there others may be reached"
+    said, passed = corrector.on_frame(frame(), CTX)
+    assert isinstance(said, Correction) and said.robot_seconds == 6.0 and passed == LOOK
 
 
-def test_after_a_touch_the_arm_goes_home() -> None:
-    (home,) = under_way().on_arrived(arrived(success=False, stopped="touch"), CTX)
-    assert isinstance(home, PostureRequest) and home.label == "home"
+def test_after_a_touch_the_arm_goes_home_and_what_is_in_the_way_is_looked_at_again() -> None:
+    corrector = under_way()
+    for _ in range(3):
+        (home,) = corrector.on_arrived(arrived(success=False, stopped="touch"), CTX)
+        assert isinstance(home, PostureRequest) and home.label == "home"
+        survey, *passed = corrector.on_arrived(arrived(), CTX)
+        state = corrector._state  # pyright: ignore[reportPrivateUsage]
+        corrector._state = replace(state, phase=Phase.MOVING, ahead=AHEAD)  # pyright: ignore[reportPrivateUsage]
+    assert isinstance(survey, Correction) and survey.reason == "the arm could show itself in 0 postures only"
+    assert passed == [LOOK]
 
 
 def test_whoever_stops_the_arm_gets_no_look_and_the_next_one_begins_again() -> None:
     corrector = under_way()
     assert not list(corrector.on_arrived(arrived(success=False, stopped="stop"), CTX))
     (survey,) = corrector.on_look_request(LOOK, CTX)
-    assert survey == LookRequest(purpose="own arm: what is in the way")
+    assert survey == SURVEY
