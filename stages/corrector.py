@@ -290,12 +290,12 @@ class Corrector(Stage):
         state = self._state
         if len(state.sights) < _FEWEST:
             few = f"the arm could show itself in {len(state.sights)} postures only"
-            if state.view is None or state.surveys == _SURVEYS:
+            if state.view is not None and state.surveys < _SURVEYS:
+                ctx.log(f"{few}; looks again at what is in the way", level="warning")
+                self._state = replace(state, phase=Phase.SURVEYING, surveys=state.surveys + 1)
+                yield LookRequest(purpose=_SURVEY)
+            else:
                 yield from self._given_up(few, ctx)
-                return
-            ctx.log(f"{few}; looks again at what is in the way", level="warning")
-            self._state = replace(state, phase=Phase.SURVEYING, surveys=state.surveys + 1)
-            yield LookRequest(purpose=_SURVEY)
             return
         assert state.pixels is not None
         fit = Registration(self._surface, state.pixels, self._config.prior).fit(state.sights)

@@ -49,14 +49,13 @@ from stages.planning.symbolic.pddl import goal_pddl
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import corrected, open_doubt, which
+from stages.scene.doubts import SURE, UNSURE, corrected, open_doubt, which
 from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
 from stages.scene.relations import Tolerances, gaps
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
-from stages.scene.text import SURE, UNSURE
 from stages.scene.virtual import satisfied, without
 
 _EXCHANGES = 200

@@ -13,10 +13,9 @@ from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose, SceneObject
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import doubts
+from stages.scene.doubts import SURE, doubts
 from stages.scene.relations import Tolerances
 from stages.scene.stance import Stances, Standing
-from stages.scene.text import SURE
 
 
 class SceneGraphBuilder(Stage):

@@ -68,9 +68,10 @@ from stages.perception.rendering.renderer import Camera, Item, Renderer
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue, Mesh
+from stages.scene.doubts import SURE, UNSURE
 from stages.scene.naming import region_name
 from stages.scene.relations import TABLE
-from stages.scene.text import SURE, UNSURE, support
+from stages.scene.text import support
 
 if TYPE_CHECKING:  # only an export speaks with ROS 2
     from runner.view.ros2_bag import BagMessage

@@ -107,7 +107,7 @@ class Blocked:
     why: str = ""
     """What the hand fails at where there is room for the object."""
     crowding: frozenset[str] = frozenset()
-    """Objects that take up other places of the step, or of those before it that it was tried after in vain."""
+    """Objects that take up other places of the step, or of steps before it whose other places did not help it."""
 
     @property
     def involved(self) -> frozenset[str]:

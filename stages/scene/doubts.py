@@ -13,6 +13,8 @@ from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import Doubt, SceneObject, Stance
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
+SURE, UNSURE = 0.9, 0.5
+"""Probabilities from which what is said of an object is called sure, and below which it is called doubtful."""
 LIKELY = 0.15
 """Probability from which on another stance is asked about."""
 UPRIGHT = 0.8

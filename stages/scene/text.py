@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from stages.messages import SceneEstimate, SceneGraph
+from stages.scene.doubts import SURE
 from stages.scene.relations import TABLE
-
-SURE, UNSURE = 0.9, 0.5
-"""Probabilities from which what is said of an object is called sure, and below which it is called doubtful."""
 
 
 def certainty(estimate: SceneEstimate) -> str:

@@ -11,8 +11,8 @@ from stages.geometry.poses import inverse
 from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import UnknownRegion
 from stages.scene.catalogue import Catalogue, CatalogueObject, Mesh
+from stages.scene.doubts import SURE, UNSURE
 from stages.scene.naming import region_name
-from stages.scene.text import SURE, UNSURE
 from stages.story.words import Words
 
 TRIANGLES = 400

@@ -18,7 +18,7 @@ from stages.devices.ros2.types import Types
 from stages.geometry.poses import inverse
 from stages.messages import Frame, ObjectPose, Pose, SceneEstimate, SceneGraph
 from stages.scene.catalogue import Catalogue, CatalogueObject
-from stages.scene.text import SURE
+from stages.scene.doubts import SURE
 
 DETECTIONS, MARKERS = "vision_msgs/msg/Detection3DArray", "visualization_msgs/msg/MarkerArray"
 STRING = "std_msgs/msg/String"

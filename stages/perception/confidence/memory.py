@@ -16,9 +16,9 @@ from stages.perception.hypotheses.unexplained import is_contradicted, looked_thr
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue
+from stages.scene.doubts import SURE
 from stages.scene.naming import Named, names_kept, unique_names
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
-from stages.scene.text import SURE
 
 _TRIANGLES = 500
 _CLEARER = 2.0
@@ -42,7 +42,8 @@ class Memory:
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def complete(self, scene: SceneGraph, known: Mapping[str, SceneObject], observation: Observation) -> SceneGraph:
-        """The scene with those ``known`` objects that it lacks, or doubts, and that may still be where they were.
+        """The scene, :meth:`named`, with those ``known`` objects that it lacks, or doubts, and that may still be where
+        they were.
 
         A stranger at such an object's place is the object, taken for something else because little of it shows; but
         where twice as much shows of the stranger, the object had been the mistake.
@@ -80,16 +81,20 @@ class Memory:
         return item if self._seen_empty(before, others, observation) else before
 
     def named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
-        """Equal objects with the names of those that are known where they stand: who moved one knows where it went."""
+        """Equal objects with the names of those that are known where they stand: who moved one knows where it went.
+
+        The only one of its kind keeps its name where that is known, or where none is known for its place.
+        """
         labels = [item.label for item in scene.objects]
-        sure = [labels.count(item.label) == 1 and item.name in known for item in scene.objects]
-        if all(sure) or not known:
+        alone = [labels.count(label) == 1 for label in labels]
+        if not known or not labels:
             return scene
         before = {name: Named(item.label, item.T_base_object[:3, 3]) for name, item in known.items()}
         kept = names_kept(labels, np.stack([item.T_base_object[:3, 3] for item in scene.objects]), before)
-        for i, item in enumerate(scene.objects):
-            if sure[i] or (kept[i] is None and labels.count(item.label) == 1):
-                kept[i] = item.name
+        kept = [
+            item.name if only and (item.name in known or name is None) else name
+            for item, only, name in zip(scene.objects, alone, kept, strict=True)
+        ]
         return self.renamed(scene, unique_names(labels, kept))
 
     def renamed(self, scene: SceneGraph, names: Sequence[str]) -> SceneGraph:
