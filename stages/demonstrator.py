@@ -316,7 +316,7 @@ class Demonstrator(Stage):
             scene = self._memory.renamed(scene, [names[item.name] for item in scene.objects])
         self._state = replace(
             self._state,
-            known={item.name: item for item in scene.objects},
+            known={item.name: item for item in scene.objects if not self._is_dubious(item)},
             looks=self._state.looks + 1,
             seen=seen,
         )
@@ -519,6 +519,12 @@ class Demonstrator(Stage):
             return f"not seen: what carries {', '.join(hanging)}" if hanging else ""
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
+
+    def _is_dubious(self, item: SceneObject) -> bool:
+        """Whether an object that the goal does not name is less likely there than not: no reason to remember it."""
+        goal = self._state.whole or self._state.goal
+        unlikely = item.probability is not None and item.probability < UNSURE
+        return unlikely and goal is not None and item.name not in _names(goal)
 
     def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
         """Objects whose pose is less probable than that, while there is a look left to see them better."""

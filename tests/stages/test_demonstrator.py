@@ -387,6 +387,18 @@ def test_an_object_whose_place_is_seen_empty_is_looked_for_then_named() -> None:
     assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
 
 
+@pytest.mark.parametrize(("probability", "left"), [(0.3, ()), (0.9, ("salt_shaker",))])
+def test_what_nobody_asked_for_and_is_hardly_there_is_not_remembered(probability: float, left: tuple[str, ...]) -> None:
+    """A shaker that one look makes out behind the carton, and the next one does not."""
+    episode, goal = Episode(), Layout({"milk_carton": upright("milk_carton", 0.1, 0.0, 0.0)})
+    goal.put("cup", 0.0, 0.0, on="milk_carton")
+    everything = Layout({**with_shaker(HIDDEN).poses, "cup": OPEN})
+    episode.until_task(goal.graph(), judged(everything.graph(), probability))
+    assert episode.planned(status="refused", reason="no room") == [LookRequest(purpose="start, look 2")]
+    (task,) = episode.seen(Layout({**CARTON.poses, "cup": OPEN}).graph(), view(everything))
+    assert isinstance(task, Task) and {item.name for item in task.current.objects} == {"milk_carton", "cup", *left}
+
+
 def test_memory_ends_where_somebody_lays_the_scene_out_anew() -> None:
     episode = Episode()
     episode.take(episode.stage.on_start(episode.ctx))

@@ -346,6 +346,28 @@ def test_an_object_that_falls_from_the_hand_is_noticed_at_once() -> None:
     assert bench.is_home()
 
 
+@pytest.mark.parametrize("barred", [False, True])
+def test_what_slides_down_in_the_hand_is_put_down_all_the_same(barred: bool) -> None:
+    """Where it was to go; where something bars that, where it was taken from."""
+    bench, began = Bench(0, "tea"), list[float]()
+    before, target = bench.poses(), standing("soup_can", 0.55, 0.45)
+
+    def let_slide(label: str) -> None:
+        if label == "lift soup_can":
+            began.append(bench.simulation.time)
+            bench.simulation.slide(0.01 if bench.simulation.time < began[0] + 0.4 else 1.0)
+        if label == "carry soup_can" and barred:
+            bench.simulation.place("sugar_box", standing("sugar_box", *target[:2, 3]), settle=0.0)
+
+    bench.meddle = let_slide
+    outcome = bench.transfer(before, "soup_can", "table", target)
+    after, expected = bench.poses()["soup_can"], before["soup_can"] if barred else target
+    assert outcome.failed_stage == ("touch" if barred else "") and bench.is_home()
+    assert outcome.T_base_object is not None
+    for T in (after, outcome.T_base_object):
+        np.testing.assert_allclose(T[:3, 3], expected[:3, 3], atol=0.01)
+
+
 def test_what_is_not_quite_where_it_was_seen_is_grasped_beside_that() -> None:
     bench = Bench(0, "tea")
     seen, target = bench.poses(), bench.poses()["cup"]

@@ -26,6 +26,8 @@ _CLEARER = 2.0
 _SAME = 0.02
 """Metres within which a doubtful pose and a sure one from before may be one: as far off as a pose is that counts as
 right."""
+_THROUGH = 0.01
+"""Metres by which an object that is remembered must reach into a surer one that is seen to be no more there."""
 _CONTENT = 0.5
 """Share of a container's footprint up to which something may stand in it."""
 
@@ -46,7 +48,8 @@ class Memory:
         they were.
 
         A stranger at such an object's place is the object, taken for something else because little of it shows; but
-        where twice as much shows of the stranger, the object had been the mistake.
+        where twice as much shows of the stranger, the object had been the mistake, as it had where a surer one that is
+        seen reaches into it.
         """
         if observation.T_base_camera is None:
             return scene
@@ -59,15 +62,16 @@ class Memory:
             false = {stranger.name for stranger in there}
             others = [other for other in scene.objects if other.name not in false]
             mistaken = any(stranger.visible > _CLEARER * item.visible for stranger in there)
+            mistaken |= any(_surer(other, item) and self._overlap(item, other, scene, _THROUGH) for other in others)
             if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
                 taken |= false
-        surer = {item.name: self._surer(item, known.get(item.name), scene, observation) for item in scene.objects}
-        if not kept and all(surer[item.name] is item for item in scene.objects):
+        best = {item.name: self._best(item, known.get(item.name), scene, observation) for item in scene.objects}
+        if not kept and all(best[item.name] is item for item in scene.objects):
             return scene
-        return self.related(scene, (*(surer[item.name] for item in scene.objects if item.name not in taken), *kept))
+        return self.related(scene, (*(best[item.name] for item in scene.objects if item.name not in taken), *kept))
 
-    def _surer(
+    def _best(
         self, item: SceneObject, before: SceneObject | None, scene: SceneGraph, observation: Observation
     ) -> SceneObject:
         """What something before a mug hides is mostly its handle: who saw that before knows better how it stands."""
@@ -116,13 +120,16 @@ class Memory:
         shape = entry.once("remembered", lambda: Shape.of(entry.simplified(_TRIANGLES)))
         return inverse_depth(shape.soup, inverse(observation.T_base_camera) @ item.T_base_object, view.view)
 
-    def _overlap(self, item: SceneObject, stranger: SceneObject, scene: SceneGraph) -> bool:
-        """Whether not both can stand there; what is small beside a container may be in it."""
+    def _overlap(self, item: SceneObject, stranger: SceneObject, scene: SceneGraph, depth: float = 0.0) -> bool:
+        """Whether not both can stand there, by more than ``depth`` metres; what is small beside a container may be in
+        it."""
         a, b = standing_of((item, stranger), self._stances, scene.T_base_table)
-        if a.stance.holds and regions.area(b.outline) < _CONTENT * regions.area(a.outline):
+        areas = [regions.area(one.outline) for one in (a, b)]
+        outer = a if areas[0] > areas[1] else b
+        if outer.stance.cavity and min(areas) < _CONTENT * max(areas):
             return False
         level = a.z_bottom < b.z_top and b.z_bottom < a.z_top
-        return level and regions.separation(a.outline, b.outline) < 0
+        return level and regions.separation(a.outline, b.outline) < -depth
 
     def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
         """The same scene with other objects: what carries what is found anew, regions stay where both objects do."""
@@ -140,3 +147,8 @@ class Memory:
                 *(item for item in scene.assertions if not beside.isdisjoint(item.arguments)),
             ),
         )
+
+
+def _surer(item: SceneObject, other: SceneObject) -> bool:
+    """Whether an object is more likely right than another one."""
+    return item.probability is not None and other.probability is not None and item.probability > other.probability

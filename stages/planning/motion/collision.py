@@ -60,7 +60,7 @@ class CollisionWorld:
         occupied: tuple[Primitive, ...] = (),
         clearance: float = 0.005,
     ) -> None:
-        self.robot, self.carried, self.checks = robot, carried, 0
+        self.robot, self.carried, self.clearance, self.checks = robot, carried, clearance, 0
         self.objects = {name: entry for name, (entry, _) in objects.items()}
         self._model = self._compile(table, objects, occupied)
         self._data = mujoco.MjData(self._model)
@@ -135,6 +135,11 @@ class CollisionWorld:
         finally:
             self._set_held(0, 0)
             self.set_width(self.robot.gripper.open_width)
+
+    def touched(self, q: Floats) -> set[str]:
+        """What is not of the robot and too close to the held object at joint positions ``q`` (J)."""
+        near = {name for pair in self.contacts(q) if "held" in pair for name in pair}
+        return near & self._geoms.keys()
 
     def move(self, T_base_object: Floats) -> None:
         """Says that the carried object now stands at ``T_base_object``."""

@@ -215,14 +215,20 @@ class PickPlacePlanner:
             if approach is None:
                 self._note("pick motion", "no straight approach to a grasp")
                 continue
-            with self.holding(hand), world.resting(self._errand.source):
-                heights = (raised(hand.T_base_hand, height) for height in (LIFT, LIFT / 2))
-                lifts = (straight_motion(world, approach[-1], T) for T in heights)
-                lift = next((found for found in lifts if found is not None), None)
+            lift = self._lift(hand, approach[-1])
             if lift is not None:
                 return Pick(hand, width, approach, lift)
             self._note("pick motion", "no way to lift it")
         return None
+
+    def _lift(self, hand: HandPose, q: Floats) -> Floats | None:
+        """Straight up from joint positions ``q``; what leans on the object, or it on that, gives way if need be."""
+        world, heights = self._world, (LIFT, LIFT / 2)
+        with self.holding(hand), world.resting(self._errand.source):
+            leaning = world.touched(q) if world.clearance == MARGINS[-1].clearance else ()
+            with world.resting(*leaning):
+                lifts = (straight_motion(world, q, raised(hand.T_base_hand, height)) for height in heights)
+                return next((found for found in lifts if found is not None), None)
 
     def _postures(self, T_base_hand: Floats, *first: Floats) -> Iterator[Floats]:
         """Joint positions (J) with the hand at a pose, collisions or not."""

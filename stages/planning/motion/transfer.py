@@ -42,7 +42,9 @@ _GENTLE, _YIELDS = 0.1, 0.004
 _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
 _EARLY = 0.025
-"""Metres above the target from which on a touch, while an object is lowered, is its support."""
+"""Metres above the target from which on a touch, while an object is lowered, is its support, whatever is beside it."""
+_SLID = 0.06
+"""Metres that an object may have slid down in the hand."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
 _PRESS = 12.0
@@ -205,8 +207,7 @@ class TransferRoutine:
         if distance > _AWAY:
             rise = straight_motion(at.world, q, raised(at.world.hand(q), LIFT), free=False)
             rise = q[None] if rise is None else rise
-            with at.planner.holding(pick.hand):
-                carry = free_motion(at.world, rise[-1], pick.lift[-1], self._rng)
+            carry = self._carry_back(at, rise[-1])
             if carry is None:
                 return "release", f"no free way back; in the hand: {at.world.carried}"
             yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
@@ -216,6 +217,18 @@ class TransferRoutine:
         # hand hangs lower by nobody knows how much.
         place, guard = Place(pick.hand, lower[: max(1, len(lower) - 1)]), Guard(force=_TOUCH + self._weight)
         return (yield from self._put_down(at, place, guard=guard, early=LIFT))
+
+    def _carry_back(self, at: _UnderWay, q: Floats) -> Floats | None:
+        """Motion (W x J) from joint positions ``q`` to the end of the lift, with room below what may have slid down."""
+        pick = at.plan.pick
+        T_base_object = pick.hand.T_base_hand @ inverse(pick.hand.T_object_hand)
+        for slid in (_SLID, 0.0):
+            T_hand_object = inverse(pick.hand.T_base_hand) @ raised(T_base_object, -slid)
+            with at.world.holding(T_hand_object, pick.hand.grasp.width):
+                carry = free_motion(at.world, q, pick.lift[-1], self._rng)
+            if carry is not None:
+                return carry
+        return None
 
     def _go_home_first(self, state: RobotState) -> Steps:
         q = self._arm(state)
@@ -261,7 +274,19 @@ class TransferRoutine:
         yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
         yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + self._weight))
         guard = replace(lifting, force=_TOUCH + self._weight)
-        return (yield from self._put_down(at, plan.place, guard=guard, early=_EARLY))
+        early = _SLID if self._stands_alone(at) else _EARLY
+        return (yield from self._put_down(at, plan.place, guard=guard, early=early))
+
+    def _stands_alone(self, at: _UnderWay) -> bool:
+        """Whether nothing is near an object's target but what will bear it, all of it at one height.
+
+        Then it is this that an object touches early, one that has slid down in the hand.
+        """
+        world, destination = at.world, at.world.objects.get(self._request.transfer.destination)
+        if destination is not None and destination.concave:
+            return False
+        with at.planner.holding(at.plan.place.hand), world.resting(self._request.transfer.destination), world.ample():
+            return world.is_free(at.plan.place.lower[-1])
 
     def _take(
         self, world: CollisionWorld, pick: Pick
@@ -321,7 +346,7 @@ class TransferRoutine:
 
     def _put_down(self, at: _UnderWay, place: Place, *, guard: Guard, early: float) -> Steps:
         """A touch less than ``early`` metres above the target is the support."""
-        world, felt = at.world, False
+        world, felt, slid = at.world, False, 0.0
         deeper = straight_motion(world, place.lower[-1], raised(place.hand.T_base_hand, _LOWEST), free=False)
         narrowest, _ = self._held_between(place.hand.grasp)
         feeling = Guard(narrowest=narrowest, force=_TOUCH, error=_YIELDS)
@@ -336,11 +361,12 @@ class TransferRoutine:
             height = world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3]
             if state.stopped != "touch" or height > early:
                 raise
+            slid = max(height, 0.0)
         held = state.gripper_width
         wanted = min(held + 2 * at.planner.release, self._robot.gripper.open_width)
         state = yield from self._do(f"let go of {world.carried}", width=wanted)
         self.in_hand = ""
-        left = world.hand(q) @ inverse(at.plan.pick.hand.T_object_hand)
+        left = raised(world.hand(q) @ inverse(at.plan.pick.hand.T_object_hand), -slid)
         world.move(left)
         self._tally.T_base_object = left
         retreat = at.planner.retreat(place.hand, q)

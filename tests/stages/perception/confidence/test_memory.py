@@ -143,6 +143,29 @@ def test_a_doubtful_pose_gives_way_to_a_sure_one_of_before(probability: float | 
     np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ (true if kept else doubted), atol=1e-9)
 
 
+@pytest.mark.parametrize(("probability", "left"), [(0.3, ["tea_box"]), (0.99, ["tea_box", "tuna_can"])])
+def test_what_reaches_into_what_is_surely_there_was_a_mistake(probability: float, left: list[str]) -> None:
+    """Part of a box was taken for a can; then the box is seen as it is."""
+    box, can = upright("tea_box", 0.1, 0.1, 0.0), upright("tuna_can", 0.12, 0.1, 0.0)
+    before = known({"tea_box": box, "tuna_can": can})
+    before["tuna_can"] = msgspec.structs.replace(before["tuna_can"], probability=probability)
+    sure = tuple(msgspec.structs.replace(item, probability=0.98) for item in graph({"tea_box": box}).objects)
+    seen = msgspec.structs.replace(graph({"tea_box": box}), objects=sure)
+    scene = MEMORY.complete(seen, before, observation({"tea_box": box, "tuna_can": can}))
+    assert names(scene) == left
+
+
+def test_what_is_in_a_container_does_not_reach_into_it() -> None:
+    for container in ("tray", "bowl", "plate"):
+        layout = Layout().put(container, 0.0, 0.0).put("tuna_can", 0.0, 0.0, on=container)
+        before = known(layout.poses)
+        before["tuna_can"] = msgspec.structs.replace(before["tuna_can"], probability=0.9)
+        sure = tuple(msgspec.structs.replace(item, probability=0.98) for item in graph(layout.poses).objects[:1])
+        seen = msgspec.structs.replace(graph({container: layout.poses[container]}), objects=sure)
+        scene = MEMORY.complete(seen, before, observation(layout.poses))
+        assert names(scene) == [container, "tuna_can"]
+
+
 def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
     """Two sponges, of which the hand has put the first where the look now calls it another one."""
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)

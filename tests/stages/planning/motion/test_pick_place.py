@@ -1,4 +1,4 @@
-"""Which side of an object a pick and its place leave to be seen."""
+"""Which grasps there are: the side that is left to be seen, and what leans on the object."""
 
 from itertools import islice
 
@@ -27,3 +27,23 @@ def test_an_object_shows_the_side_that_its_target_says_where_that_matters(name: 
     alike = target @ entry.symmetries.transforms(np.deg2rad(22.5))
     assert ends and all(min(np.abs(end - T).max() for T in alike) < 1e-6 for end in ends)
     assert all(np.allclose(end, target, atol=1e-6) for end in ends) == faces
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.02])
+def test_an_object_that_something_leans_on_is_lifted_with_the_least_margins(gap: float) -> None:
+    """A box with a sponge at its foot."""
+    entries = catalogue()
+    beside = (entries["tea_box"].dimensions[1] + entries["sponge"].dimensions[1]) / 2 + gap
+    poses = {"tea_box": standing("tea_box", 0.65, 0.1), "sponge": standing("sponge", 0.65, 0.1 + beside)}
+    transfer = Transfer(
+        object="tea_box",
+        source="table",
+        destination="table",
+        T_base_targets=standing("tea_box", 0.65, -0.2)[None],
+        pick="",
+        place="",
+    )
+    objects = {name: (entries[name], T) for name, T in poses.items()}
+    ways = planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0))
+    found = [planner.can_pick(ROBOT.home) for _, planner in ways]
+    assert found == ([False, False, True] if gap < 0.002 else [True, True, True])
