@@ -22,7 +22,8 @@ from stages.scene.stance import TIPPED, Stances, standing_of, turned
 
 _TRIANGLES = 500
 _CLEARER = 2.0
-"""How many times as much must show of what is seen now as showed of what was seen before in its place."""
+"""How many times as much must show of what is seen now, but not surely, as showed of what was seen before in its
+place; of what is surely seen it is enough that no less shows."""
 _SAME = 0.02
 """Metres within which a doubtful pose and a sure one from before may be one: as far off as a pose is that counts as
 right."""
@@ -48,8 +49,8 @@ class Memory:
         they were.
 
         A stranger at such an object's place is the object, taken for something else because little of it shows; but
-        where twice as much shows of the stranger, the object had been the mistake, as it had where a surer one that is
-        seen reaches into it.
+        where more shows of the stranger, the object had been the mistake, as it had where a surer one that is seen
+        reaches into it.
         """
         if observation.T_base_camera is None:
             return scene
@@ -61,7 +62,7 @@ class Memory:
             there = [stranger for stranger in strangers if self._overlap(item, stranger, scene)]
             false = {stranger.name for stranger in there}
             others = [other for other in scene.objects if other.name not in false]
-            mistaken = any(stranger.visible > _CLEARER * item.visible for stranger in there)
+            mistaken = any(_clearer(stranger, item) for stranger in there)
             mistaken |= any(_surer(other, item) and self._overlap(item, other, scene, _THROUGH) for other in others)
             if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
@@ -152,3 +153,10 @@ class Memory:
 def _surer(item: SceneObject, other: SceneObject) -> bool:
     """Whether an object is more likely right than another one."""
     return item.probability is not None and other.probability is not None and item.probability > other.probability
+
+
+def _clearer(stranger: SceneObject, before: SceneObject) -> bool:
+    """Whether what is seen now is believed rather than what was seen before in its place."""
+    if stranger.probability is not None and stranger.probability >= SURE:
+        return stranger.visible >= before.visible
+    return stranger.visible > _CLEARER * before.visible

@@ -86,13 +86,20 @@ def test_what_was_taken_for_a_stranger_is_what_stood_there() -> None:
     assert not any("soup_can" in text for text in asserted(scene))
 
 
-def test_a_stranger_of_which_much_more_shows_is_believed() -> None:
-    """A can that was called a salt shaker while a carton hid most of it."""
+@pytest.mark.parametrize(
+    ("visible", "probability", "believed"),
+    [(0.2, None, True), (0.8, None, False), (0.8, 0.95, True), (0.8, 0.5, False), (1.0, 0.95, False)],
+)
+def test_a_stranger_of_which_more_shows_is_believed(visible: float, probability: float | None, believed: bool) -> None:
+    """A can that was called a salt shaker while a carton hid some of it."""
     can = {"soup_can": upright("soup_can", 0.06, 0.05, 0.0)}
-    for visible, expected in ((0.2, ["soup_can"]), (0.8, ["salt_shaker"])):
-        before = known({"salt_shaker": HALF_BEHIND})
-        before = {name: msgspec.structs.replace(item, visible=visible) for name, item in before.items()}
-        assert names(MEMORY.complete(graph(can), before, observation(can))) == expected
+    before = msgspec.structs.replace(known({"salt_shaker": HALF_BEHIND})["salt_shaker"], visible=visible)
+    (now,) = graph(can).objects
+    seen = msgspec.structs.replace(
+        graph(can), objects=(msgspec.structs.replace(now, visible=0.9, probability=probability),)
+    )
+    scene = MEMORY.complete(seen, {"salt_shaker": before}, observation(can))
+    assert names(scene) == ["soup_can" if believed else "salt_shaker"]
 
 
 def test_a_stranger_elsewhere_is_kept() -> None:
