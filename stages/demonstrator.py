@@ -523,14 +523,13 @@ class Demonstrator(Stage):
     def _is_dubious(self, item: SceneObject) -> bool:
         """Whether an object that the goal does not name is less likely there than not: no reason to remember it."""
         goal = self._state.whole or self._state.goal
-        unlikely = item.probability is not None and item.probability < UNSURE
-        return unlikely and goal is not None and item.name not in _names(goal)
+        return _less_than(item, UNSURE) and goal is not None and item.name not in _names(goal)
 
     def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
         """Objects whose pose is less probable than that, while there is a look left to see them better."""
         if self._state.repeats == self._config.repeats:
             return []
-        return [item.name for item in scene.objects if item.probability is not None and item.probability < least]
+        return [item.name for item in scene.objects if _less_than(item, least)]
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
@@ -561,6 +560,9 @@ class Demonstrator(Stage):
             return self._compare(rest, scene, ctx)
         if not violated and self._state.lacking:
             return self._fail("perception", f"{self._state.lacking}; every other relation of the goal holds", ctx)
+        if not violated and (unsure := _doubtful_parents(goal)):
+            why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
+            return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
         if not violated:
             return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
         if self._state.transfers == self._config.max_transfers:
@@ -704,6 +706,17 @@ class AskedDemonstrator(KeepingDemonstrator):
 
 def _names(scene: SceneGraph) -> set[str]:
     return {item.name for item in scene.objects}
+
+
+def _doubtful_parents(goal: SceneGraph) -> list[str]:
+    """Objects in doubt with which places of others turn."""
+    parents = {item.parent for item in goal.virtual_objects}
+    return [item.name for item in goal.objects if item.name in parents and _less_than(item, SURE)]
+
+
+def _less_than(item: SceneObject, least: float) -> bool:
+    """Whether a pose is less probable than that; one that nobody has judged is not."""
+    return item.probability is not None and item.probability < least
 
 
 def _spares(scene: SceneGraph, goal: SceneGraph) -> bool:

@@ -674,6 +674,16 @@ def test_a_goal_that_is_in_doubt_is_looked_at_again_before_it_is_remembered() ->
     assert isinstance(goal, Goal)  # with what there is, after as many looks as are taken
 
 
+@pytest.mark.parametrize("probability", [0.6, 0.95])
+def test_no_success_is_claimed_where_a_place_turns_with_what_was_in_doubt(probability: float) -> None:
+    """Beside the tray stands a can; which way the tray lies was in doubt, look after look."""
+    episode, taught = Episode(repeats=0), judged(GOAL, probability)
+    episode.until_start(taught)
+    verdict = the_verdict(episode.seen(judged(GOAL, 0.99)))
+    assert verdict.success == (probability > 0.9) and not verdict.violated
+    assert ("tray was in doubt when the goal was taught" in verdict.reason) == (not verdict.success)
+
+
 def test_what_is_in_doubt_is_looked_at_a_second_time_before_it_is_moved() -> None:
     episode = Episode()
     episode.until_task(start=judged(START, 0.3))
