@@ -85,7 +85,7 @@ class Truth:
         shown = max(k for k, one in enumerate(snapshots) if _shows(one.purpose, goal.name))
         wanted = self._wanted(self._as_taught(snapshots[shown], goal.scene), goal.scene)
         ends = (self._scene(final, goal.scene) for final in self._exchanged(snapshots[-1]))
-        found = [satisfied(wanted, end, self._catalogue) for end in ends]
+        found = [satisfied(wanted, end, self._catalogue, share=1.0) for end in ends]
         held, violated = min(found, key=lambda relations: len(relations[1]))
         return Judgement(
             verdict.success, held, violated, _differences(held, violated, verdict),

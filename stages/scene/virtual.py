@@ -16,6 +16,9 @@ from stages.scene.catalogue import Catalogue, Symmetries
 from stages.scene.relations import Support
 from stages.scene.stance import Standing
 
+CLAIMED = 0.85
+"""Share of a region's radius within which what is perceived to be in it is said to be: the rest is for perception's
+errors."""
 SYMMETRY_STEP = np.deg2rad(4)
 """Sampling of continuous symmetries when a ring is evaluated, radians: 1 cm at 15 cm from the axis."""
 
@@ -114,10 +117,12 @@ def region_poses(virtual: VirtualObject, T_base_parent: Floats, symmetries: Symm
     return T_base_parent @ turned.reshape(-1, 4, 4) @ virtual.T_parent_virtual
 
 
-def in_region(virtual: VirtualObject, T_base_parent: Floats, T_base_child: Floats, symmetries: Symmetries) -> bool:
-    """Whether the child stands within the region's radius, horizontally, of one of the region's poses."""
+def in_region(
+    virtual: VirtualObject, T_base_parent: Floats, T_base_child: Floats, symmetries: Symmetries, share: float = CLAIMED
+) -> bool:
+    """Whether the child stands within ``share`` of the region's radius, horizontally, of one of the region's poses."""
     centres = region_poses(virtual, T_base_parent, symmetries)[:, :2, 3]
-    return bool(np.linalg.norm(centres - T_base_child[:2, 3], axis=1).min() <= virtual.radius)
+    return bool(np.linalg.norm(centres - T_base_child[:2, 3], axis=1).min() <= share * virtual.radius)
 
 
 def rerooted(goal: SceneGraph, root: str) -> SceneGraph:
@@ -165,26 +170,28 @@ def without(goal: SceneGraph, names: set[str]) -> SceneGraph:
 
 
 def satisfied(
-    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue
+    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue, share: float = CLAIMED
 ) -> tuple[tuple[Assertion, ...], tuple[Assertion, ...]]:
     """The goal's assertions that hold in the current scene, and those that do not.
 
     Compares the topological layout (paper, section VI-B): exist, on, in and clear as the current scene asserts them;
-    has and in of a virtual object by the current poses, whatever virtual objects the current scene has, and faces by
-    the current poses. Poses and objects that the goal does not name are not compared, except that these may not be on
-    or in a goal object that was clear.
+    has and in of a virtual object by the current poses, in ``share`` of its radius, whatever virtual objects the
+    current scene has, and faces by the current poses. Poses and objects that the goal does not name are not compared,
+    except that these may not be on or in a goal object that was clear.
     """
     # Regions of the current scene may have the same names and mean other places.
     regions_now = {item.name for item in current.virtual_objects}
     real = (item for item in current.assertions if regions_now.isdisjoint(item.arguments))
     asserted = {(item.predicate, item.arguments) for item in real}
-    asserted |= _held_regions(goal, current, catalogue) | facing.held(goal, current)
+    asserted |= _held_regions(goal, current, catalogue, share) | facing.held(goal, current)
     held = [item for item in goal.assertions if (item.predicate, item.arguments) in asserted]
     violated = [item for item in goal.assertions if (item.predicate, item.arguments) not in asserted]
     return tuple(held), tuple(violated)
 
 
-def _held_regions(goal: SceneGraph, current: SceneGraph, catalogue: Catalogue) -> set[tuple[str, tuple[str, ...]]]:
+def _held_regions(
+    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue, share: float
+) -> set[tuple[str, tuple[str, ...]]]:
     poses = {item.name: item for item in current.objects}
     held: set[tuple[str, tuple[str, ...]]] = set()
     for virtual in goal.virtual_objects:
@@ -193,6 +200,6 @@ def _held_regions(goal: SceneGraph, current: SceneGraph, catalogue: Catalogue) -
             continue
         held.add(("has", (virtual.parent, virtual.name)))
         symmetries = catalogue[parent.label].symmetries
-        if child is not None and in_region(virtual, parent.T_base_object, child.T_base_object, symmetries):
+        if child is not None and in_region(virtual, parent.T_base_object, child.T_base_object, symmetries, share):
             held.add(("in", (virtual.name, virtual.child)))
     return held

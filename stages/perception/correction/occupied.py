@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
@@ -19,6 +21,8 @@ _LEAST = 0.03
 _TALLEST = 0.6
 _MARGIN = 0.05
 """Metres by which boxes are larger: as much as an uncalibrated camera is off, and what lies in the shadow."""
+_WIDEST = 0.2
+"""Metres across up to which what is connected is one box: one tall object does not make all that it touches as high."""
 _HIGHER = 0.03
 """Metres by which the table is higher: as much as an uncalibrated camera is off in height."""
 
@@ -48,13 +52,25 @@ def occupied(
 
 
 def _boxes(points: Floats, low: Floats, high: Floats, height: float) -> Floats:
-    """One box around the readings of each part, N x 6."""
+    """One box around the readings of each part, or several around those of a wide one, N x 6."""
     cells = np.floor((points[:, :2] - low) / _CELL).astype(np.int64)
     counts = np.zeros(np.ceil((high - low) / _CELL).astype(int) + 1, np.int64)
     np.add.at(counts, tuple(cells.T), 1)
     parts, labels = cv2.connectedComponents((counts >= _PER_CELL).astype(np.uint8), connectivity=8)
     of = labels[tuple(cells.T)]
-    found = [points[of == part] for part in range(1, parts)]
+    found = [piece for part in range(1, parts) for piece in _pieces(points[of == part])]
     return np.array([[*(one.min(0)[:2] - _MARGIN), height, *(one.max(0) + _MARGIN)] for one in found], float).reshape(
         -1, 6
     )
+
+
+def _pieces(points: Floats) -> Iterator[Floats]:
+    """Points, halved across until none of the pieces is too wide."""
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    axis = int((high - low).argmax())
+    if high[axis] - low[axis] <= _WIDEST:
+        yield points
+        return
+    beyond = points[:, axis] > (low + high)[axis] / 2
+    yield from _pieces(points[~beyond])
+    yield from _pieces(points[beyond])

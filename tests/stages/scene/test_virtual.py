@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from stages.messages import SceneGraph
 from stages.scene.stance import yawed
-from stages.scene.virtual import rerooted, satisfied
+from stages.scene.virtual import CLAIMED, rerooted, satisfied
 from tests.stages.layouts import Layout, asserted, breakfast, builder, catalogue
 
 
@@ -28,6 +28,15 @@ def test_neighbours_get_a_region_of_the_larger_one():
     graph = beside().graph()
     assert pairs(graph) == {("cereal_box", "mug")}
     assert {"has(cereal_box, mug_near_cereal_box)", "in(mug_near_cereal_box, mug)"} <= asserted(graph)
+
+
+@pytest.mark.parametrize(("away", "perceived", "true"), [(0.8, True, True), (0.9, False, True), (1.1, False, False)])
+def test_at_the_edge_of_a_region_perception_claims_nothing(away: float, perceived: bool, true: bool) -> None:
+    goal = beside().graph()
+    moved = Layout().put("cereal_box", 0, 0).put("mug", 0.0, 0.13 + away * goal.virtual_objects[0].radius)
+    now = moved.put("soup_can", 0.3, 0.3).graph()
+    for share, expected in ((CLAIMED, perceived), (1.0, true)):
+        assert (not satisfied(goal, now, catalogue(), share)[1]) == expected
 
 
 def test_objects_on_different_supports_are_not_beside_each_other():

@@ -23,3 +23,18 @@ def test_the_table_is_not_lower_and_things_not_smaller_than_they_are(depth: floa
     assert ROBOT.table.height < height < ROBOT.table.height + 0.06
     low, high = box[:2] - ROBOT.table.center, box[3:5] - ROBOT.table.center
     assert (low < -0.03).all() and (high > 0.03).all() and box[5] > ROBOT.table.height + 0.15
+
+
+def test_one_tall_object_does_not_make_all_that_it_touches_as_high() -> None:
+    """A bottle at the end of a row of low things: over the other end the arm has room."""
+    T_base_table = pose(np.eye(3), np.array([*ROBOT.table.center, ROBOT.table.height]))
+    row = {"tea_box": -0.12, "sponge": 0.0, "water_bottle": 0.09}
+    seen = render({name: upright(name, x, 0.0, np.pi / 2) for name, x in row.items()})
+    T_base_camera = T_base_table @ inverse(camera())
+    found = occupied(seen.scene.depth, VIEW, T_base_camera, ROBOT, np.random.default_rng(0))
+    assert found is not None
+    (low, high) = (
+        max(box[5] for box in found[1] if box[0] < x < box[3]) - ROBOT.table.height
+        for x in np.array([-0.12, 0.09]) + ROBOT.table.center[0]
+    )
+    assert low < 0.15 and high > 0.2
