@@ -58,7 +58,7 @@ _WIDER = 0.012
 _EMPTY = 0.003
 """Metres beyond closed up to which nothing is between the fingers."""
 _G = 9.81
-_WAYS_BACK = 3
+_WAYS_BACK = 4
 """Times that the way back is tried."""
 _AWAY = 0.05
 """Radians from home beyond which the arm first goes home, and from a straight way within which it returns along it."""
@@ -201,34 +201,19 @@ class TransferRoutine:
         return (yield from self._home(at.world, q, rise=rise))
 
     def _put_back(self, at: _UnderWay, q: Floats) -> Steps:
-        """What is held returns to where it was taken from, which is free and within reach."""
-        pick = at.plan.pick
+        """What is held returns the way it came to where it was taken from: both are free and within reach."""
+        pick, carried = at.plan.pick, at.world.carried
         distance, lower = _back(pick.lift, q)
         if distance > _AWAY:
-            rise = straight_motion(at.world, q, raised(at.world.hand(q), LIFT), free=False)
-            rise = q[None] if rise is None else rise
-            carry = self._carry_back(at, rise[-1])
-            if carry is None:
-                return "release", f"no free way back; in the hand: {at.world.carried}"
-            yield from self._do(f"raise {at.world.carried}", rise, speed=_SLOW)
-            yield from self._do(f"carry {at.world.carried} back", carry)
+            way = densify(np.vstack([at.plan.carry, at.plan.place.lower]), _RETRACED)
+            narrowest, widest = self._held_between(pick.hand.grasp)
+            guard = Guard(narrowest=narrowest, widest=widest, force=_RUB + self._weight)
+            yield from self._do(f"carry {carried} back", _back(way, q)[1], speed=_SLOW, guard=guard)
             lower = pick.lift[::-1]
         # Straight down the way it came, but for the last waypoint: from there on it is felt for. What has slid in the
         # hand hangs lower by nobody knows how much.
         place, guard = Place(pick.hand, lower[: max(1, len(lower) - 1)]), Guard(force=_TOUCH + self._weight)
         return (yield from self._put_down(at, place, guard=guard, early=LIFT))
-
-    def _carry_back(self, at: _UnderWay, q: Floats) -> Floats | None:
-        """Motion (W x J) from joint positions ``q`` to the end of the lift, with room below what may have slid down."""
-        pick = at.plan.pick
-        T_base_object = pick.hand.T_base_hand @ inverse(pick.hand.T_object_hand)
-        for slid in (_SLID, 0.0):
-            T_hand_object = inverse(pick.hand.T_base_hand) @ raised(T_base_object, -slid)
-            with at.world.holding(T_hand_object, pick.hand.grasp.width):
-                carry = free_motion(at.world, q, pick.lift[-1], self._rng)
-            if carry is not None:
-                return carry
-        return None
 
     def _go_home_first(self, state: RobotState) -> Steps:
         q = self._arm(state)
