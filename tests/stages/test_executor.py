@@ -346,11 +346,13 @@ def test_an_object_that_falls_from_the_hand_is_noticed_at_once() -> None:
     assert bench.is_home()
 
 
-@pytest.mark.parametrize("barred", [False, True])
-def test_what_slides_down_in_the_hand_is_put_down_all_the_same(barred: bool) -> None:
+@pytest.mark.parametrize(("destination", "barred"), [("table", False), ("tray", False), ("table", True)])
+def test_what_slides_down_in_the_hand_is_put_down_all_the_same(destination: str, barred: bool) -> None:
     """Where it was to go; where something bars that, where it was taken from."""
     bench, began = Bench(0, "tea"), list[float]()
     before, target = bench.poses(), standing("soup_can", 0.55, 0.45)
+    if destination == "tray":
+        target[:3, 3] = before["tray"][:3, 3] + [0, 0, 0.04]
 
     def let_slide(label: str) -> None:
         if label == "lift soup_can":
@@ -360,7 +362,7 @@ def test_what_slides_down_in_the_hand_is_put_down_all_the_same(barred: bool) -> 
             bench.simulation.place("sugar_box", standing("sugar_box", *target[:2, 3]), settle=0.0)
 
     bench.meddle = let_slide
-    outcome = bench.transfer(before, "soup_can", "table", target)
+    outcome = bench.transfer(before, "soup_can", destination, target)
     after, expected = bench.poses()["soup_can"], before["soup_can"] if barred else target
     assert outcome.failed_stage == ("touch" if barred else "") and bench.is_home()
     assert outcome.T_base_object is not None

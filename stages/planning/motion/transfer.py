@@ -263,15 +263,15 @@ class TransferRoutine:
         return (yield from self._put_down(at, plan.place, guard=guard, early=early))
 
     def _stands_alone(self, at: _UnderWay) -> bool:
-        """Whether nothing is near an object's target but what will bear it, all of it at one height.
+        """Whether nothing is near an object, coming down, but what will bear it.
 
-        Then it is this that an object touches early, one that has slid down in the hand.
+        Then it is this that it touches early, once it has slid down in the hand.
         """
-        world, destination = at.world, at.world.objects.get(self._request.transfer.destination)
-        if destination is not None and destination.concave:
-            return False
-        with at.planner.holding(at.plan.place.hand), world.resting(self._request.transfer.destination), world.ample():
-            return world.is_free(at.plan.place.lower[-1])
+        world, place = at.world, at.plan.place
+        heights = [world.hand(q)[2, 3] - place.hand.T_base_hand[2, 3] for q in place.lower]
+        q = place.lower[max(k for k, height in enumerate(heights) if height > _EARLY)]
+        with at.planner.holding(place.hand), world.ample():
+            return world.is_free(q)
 
     def _take(
         self, world: CollisionWorld, pick: Pick
