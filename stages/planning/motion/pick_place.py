@@ -24,6 +24,8 @@ ABOVE = 0.10
 """Metres above its target from which an object is lowered."""
 HOVER = 0.008
 """Metres above its target where lowering becomes guarded: below, the support's estimated height is not trusted."""
+SLID = 0.06
+"""Metres that an object may slide down in the hand."""
 RELEASE = 0.010
 """Metres that each finger opens to let go, where there is room."""
 
@@ -189,12 +191,23 @@ class PickPlacePlanner:
             if reach is None:
                 self._note("pick motion", "no free motion to the pre-grasp")
                 continue
-            with self.holding(pick.hand):
-                carry = free_motion(self._world, pick.lift[-1], place.lower[0], self._rng)
+            carry = self._carry(pick, place)
             if carry is None:
                 self._note("place motion", "no free motion that carries it to the target")
                 continue
             yield PickPlace(pick, place, reach, carry)
+
+    def _carry(self, pick: Pick, place: Place) -> Floats | None:
+        """At best with room below for an object that slides down in the hand."""
+        hand = pick.hand
+        T_base_object = hand.T_base_hand @ inverse(hand.T_object_hand)
+        for slid in (SLID, 0.0):
+            T_hand_object = inverse(hand.T_base_hand) @ raised(T_base_object, -slid)
+            with self._world.holding(T_hand_object, hand.grasp.width):
+                carry = free_motion(self._world, pick.lift[-1], place.lower[0], self._rng)
+            if carry is not None:
+                return carry
+        return None
 
     def _picks(self, grasp: Grasp, start: Floats) -> Iterator[Pick]:
         for hand in self._hands(grasp, self._errand.T_base_object):

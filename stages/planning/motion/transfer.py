@@ -20,6 +20,7 @@ from stages.planning.motion.motion import FAST, arm, densify, free_motion, robot
 from stages.planning.motion.pick_place import (
     LIFT,
     MARGINS,
+    SLID,
     Pick,
     PickPlace,
     PickPlacePlanner,
@@ -43,8 +44,6 @@ _LOWEST = -0.008
 """Metres below the estimated target at which guarded lowering stops, whatever it feels."""
 _EARLY = 0.025
 """Metres above the target from which on a touch, while an object is lowered, is its support, whatever is beside it."""
-_SLID = 0.06
-"""Metres that an object may have slid down in the hand."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
 _PRESS = 12.0
@@ -259,7 +258,7 @@ class TransferRoutine:
         yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
         yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + self._weight))
         guard = replace(lifting, force=_TOUCH + self._weight)
-        early = _SLID if self._stands_alone(at) else _EARLY
+        early = SLID if self._stands_alone(at) else _EARLY
         return (yield from self._put_down(at, plan.place, guard=guard, early=early))
 
     def _stands_alone(self, at: _UnderWay) -> bool:

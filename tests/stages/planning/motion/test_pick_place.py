@@ -1,13 +1,14 @@
-"""Which grasps there are: the side that is left to be seen, and what leans on the object."""
+"""Which grasps there are, and how an object is carried."""
 
 from itertools import islice
 
 import numpy as np
 import pytest
 
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, raised
 from stages.messages import Transfer
-from stages.planning.motion.pick_place import planners
+from stages.planning.motion.motion import is_motion_free
+from stages.planning.motion.pick_place import SLID, planners
 from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
 
 
@@ -47,3 +48,24 @@ def test_an_object_that_something_leans_on_is_lifted_with_the_least_margins(gap:
     ways = planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0))
     found = [planner.can_pick(ROBOT.home) for _, planner in ways]
     assert found == ([False, False, True] if gap < 0.002 else [True, True, True])
+
+
+def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> None:
+    """A carton over a box as high as it was lifted."""
+    entries = catalogue()
+    poses = {"milk_carton": standing("milk_carton", 0.6, 0.25), "cereal_box": standing("cereal_box", 0.62, 0.0)}
+    transfer = Transfer(
+        object="milk_carton",
+        source="table",
+        destination="table",
+        T_base_targets=standing("milk_carton", 0.6, -0.25)[None],
+        pick="",
+        place="",
+    )
+    objects = {name: (entries[name], T) for name, T in poses.items()}
+    world, planner = next(planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0)))
+    plan = next(planner.plans(ROBOT.home))
+    hand = plan.pick.hand
+    hanging = raised(hand.T_base_hand @ inverse(hand.T_object_hand), -SLID)
+    with world.holding(inverse(hand.T_base_hand) @ hanging, hand.grasp.width):
+        assert is_motion_free(world, plan.carry)
