@@ -49,7 +49,7 @@ from stages.planning.symbolic.pddl import goal_pddl
 from stages.robots import BUILT_IN as ROBOT
 from stages.robots import read_robot
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import SURE, UNSURE, corrected, open_doubt, which
+from stages.scene.doubts import SURE, UNSURE, corrected, is_below, open_doubt, which
 from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
@@ -316,7 +316,7 @@ class Demonstrator(Stage):
             scene = self._memory.renamed(scene, [names[item.name] for item in scene.objects])
         self._state = replace(
             self._state,
-            known={item.name: item for item in scene.objects if not self._is_dubious(item)},
+            known={item.name: item for item in scene.objects if not self._is_unlikely(item)},
             looks=self._state.looks + 1,
             seen=seen,
         )
@@ -520,16 +520,16 @@ class Demonstrator(Stage):
         names = _names(self._state.goal) - _names(scene)
         return f"not seen: {', '.join(sorted(names))}" if names else ""
 
-    def _is_dubious(self, item: SceneObject) -> bool:
+    def _is_unlikely(self, item: SceneObject) -> bool:
         """Whether an object that the goal does not name is less likely there than not: no reason to remember it."""
         goal = self._state.whole or self._state.goal
-        return _less_than(item, UNSURE) and goal is not None and item.name not in _names(goal)
+        return is_below(item, UNSURE) and goal is not None and item.name not in _names(goal)
 
     def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
         """Objects whose pose is less probable than that, while there is a look left to see them better."""
         if self._state.repeats == self._config.repeats:
             return []
-        return [item.name for item in scene.objects if _less_than(item, least)]
+        return [item.name for item in scene.objects if is_below(item, least)]
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
@@ -711,12 +711,7 @@ def _names(scene: SceneGraph) -> set[str]:
 def _doubtful_parents(goal: SceneGraph) -> list[str]:
     """Objects in doubt with which places of others turn."""
     parents = {item.parent for item in goal.virtual_objects}
-    return [item.name for item in goal.objects if item.name in parents and _less_than(item, SURE)]
-
-
-def _less_than(item: SceneObject, least: float) -> bool:
-    """Whether a pose is less probable than that; one that nobody has judged is not."""
-    return item.probability is not None and item.probability < least
+    return [item.name for item in goal.objects if item.name in parents and is_below(item, SURE)]
 
 
 def _spares(scene: SceneGraph, goal: SceneGraph) -> bool:

@@ -13,7 +13,7 @@ from stages.messages import SceneEstimate, SceneGraph
 from stages.messages.scene import ObjectPose, SceneObject
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import SURE, doubts
+from stages.scene.doubts import SURE, doubts, is_below
 from stages.scene.relations import Tolerances
 from stages.scene.stance import Stances, Standing
 
@@ -59,7 +59,7 @@ class SceneGraphBuilder(Stage):
             supports,
             gap=self._config.gap,
             radius=self._config.radius,
-            doubtful={item.name for item in found if item.probability is not None and item.probability < SURE},
+            doubtful={item.name for item in found if is_below(item, SURE)},
         )
         T_base_camera = scene_estimate.T_base_camera if scene_estimate.T_base_camera is not None else T_table_camera
         return SceneGraph(

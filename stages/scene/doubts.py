@@ -23,6 +23,11 @@ Relate = Callable[[SceneGraph, tuple[SceneObject, ...]], SceneGraph]
 """The same scene with other objects, their relations found anew."""
 
 
+def is_below(item: SceneObject | ObjectPose, least: float) -> bool:
+    """Whether a pose is less probable than that; one that nobody has judged is not."""
+    return item.probability is not None and item.probability < least
+
+
 def doubts(estimate: SceneEstimate, catalogue: Catalogue) -> tuple[Doubt, ...]:
     """What an estimate leaves open: objects that may stand otherwise, and whether something is unknown."""
     T_base_camera = estimate.T_base_camera

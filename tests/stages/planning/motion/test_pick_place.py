@@ -5,11 +5,24 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, raised
 from stages.messages import Transfer
+from stages.planning.motion.collision import CollisionWorld
 from stages.planning.motion.motion import is_motion_free
-from stages.planning.motion.pick_place import SLID, planners
+from stages.planning.motion.pick_place import SLID, PickPlacePlanner, planners
 from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
+
+
+def ways(
+    name: str, poses: dict[str, Floats], target: Floats, *, faces: bool = False
+) -> list[tuple[CollisionWorld, PickPlacePlanner]]:
+    """Planners that move one of the objects on the table to another place on it, the widest margins first."""
+    transfer = Transfer(
+        object=name, source="table", destination="table", T_base_targets=target[None], pick="", place="", faces=faces
+    )
+    objects = {one: (catalogue()[one], T) for one, T in poses.items()}
+    return list(planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize("faces", [False, True])
@@ -17,10 +30,7 @@ from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
 def test_an_object_shows_the_side_that_its_target_says_where_that_matters(name: str, faces: bool) -> None:
     entry, T = catalogue()[name], standing(name, 0.65, 0.1)
     target = standing(name, 0.65, -0.1, yaw=np.pi)
-    transfer = Transfer(
-        object=name, source="table", destination="table", T_base_targets=target[None], pick="", place="", faces=faces
-    )
-    _, planner = next(planners(ROBOT, TABLE, {name: (entry, T)}, transfer, np.random.default_rng(0)))
+    (_, planner), *_ = ways(name, {name: T}, target, faces=faces)
     ends = [
         plan.place.hand.T_base_hand @ inverse(plan.pick.hand.T_object_hand)
         for plan in islice(planner.plans(ROBOT.home), 6)
@@ -36,34 +46,14 @@ def test_an_object_that_something_leans_on_is_lifted_with_the_least_margins(gap:
     entries = catalogue()
     beside = (entries["tea_box"].dimensions[1] + entries["sponge"].dimensions[1]) / 2 + gap
     poses = {"tea_box": standing("tea_box", 0.65, 0.1), "sponge": standing("sponge", 0.65, 0.1 + beside)}
-    transfer = Transfer(
-        object="tea_box",
-        source="table",
-        destination="table",
-        T_base_targets=standing("tea_box", 0.65, -0.2)[None],
-        pick="",
-        place="",
-    )
-    objects = {name: (entries[name], T) for name, T in poses.items()}
-    ways = planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0))
-    found = [planner.can_pick(ROBOT.home) for _, planner in ways]
+    found = [planner.can_pick(ROBOT.home) for _, planner in ways("tea_box", poses, standing("tea_box", 0.65, -0.2))]
     assert found == ([False, False, True] if gap < 0.002 else [True, True, True])
 
 
 def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> None:
     """A carton around a box that it would pass 4 cm above."""
-    entries = catalogue()
     poses = {"milk_carton": standing("milk_carton", 0.6, 0.25), "tea_box": standing("tea_box", 0.6, 0.0)}
-    transfer = Transfer(
-        object="milk_carton",
-        source="table",
-        destination="table",
-        T_base_targets=standing("milk_carton", 0.6, -0.25)[None],
-        pick="",
-        place="",
-    )
-    objects = {name: (entries[name], T) for name, T in poses.items()}
-    (_, planner), *_, (world, _) = planners(ROBOT, TABLE, objects, transfer, np.random.default_rng(0))
+    (_, planner), *_, (world, _) = ways("milk_carton", poses, standing("milk_carton", 0.6, -0.25))
     plan = next(planner.plans(ROBOT.home))
     hand = plan.pick.hand
     hanging = raised(hand.T_base_hand @ inverse(hand.T_object_hand), -SLID)
