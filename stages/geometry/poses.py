@@ -78,6 +78,12 @@ def rotate(R: Floats, points: Floats) -> Floats:
     return reduce(add, (R[..., k] * points[..., k, None] for k in range(3)))
 
 
+def turned_within(poses: Floats, turns: Floats) -> Floats:
+    """Poses A x 3 x 4 after turns S x 3 x 4 (or S x 4 x 4) in the object's own frame, A x S x 3 x 4."""
+    R, t = poses[:, None, :, :3], poses[:, None, :, 3]
+    return np.concatenate([compose(R, turns[:, :3, :3]), (rotate(R, turns[:, :3, 3]) + t)[..., None]], -1)
+
+
 def along(vectors: Floats, direction: Floats) -> Floats:
     """Inner products of vectors, ... x 3 and ... x 3 -> ..., without BLAS."""
     return reduce(add, (vectors[..., k] * direction[..., k] for k in range(3)))

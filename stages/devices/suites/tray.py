@@ -9,6 +9,7 @@ from itertools import combinations, permutations
 import numpy as np
 
 from runner.contract import Refused
+from stages.devices.suites.draft import BESIDE
 from stages.devices.suites.placing import support_height, upright
 from stages.devices.suites.suite import Kind, Rejected, Suite, graspable, shift
 from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
@@ -23,6 +24,10 @@ _NEAR, _FAR = 0.52, 0.80
 """Metres ahead between which objects stand."""
 _APART = 0.04
 """Metres between objects that are not placed together: room for a finger."""
+_BESIDE = BESIDE + 0.01
+"""Gap between objects below which they may be seen as standing beside each other, metres."""
+_REGION = 0.03
+"""Metres beside the place that was shown where an object may stand as well."""
 _EDGE = 0.08
 """Metres from the table's edge that the middle of a stranger keeps."""
 _STACKED_SHARE = 0.3
@@ -113,12 +118,17 @@ class Tray(Suite):
         self.table = robot.table
         self._strangers = look_alikes(self._goal, catalogue, np.random.default_rng([seed, 2]))[:strangers]
         self.names = (*object_names(self._goal), *self._strangers)
+        self._shown: Layout = {}
+        """The newest goal: what a start must leave room for."""
 
     def sample(self, kind: Kind, rng: np.random.Generator) -> Layout:
         """A scene of the goal; the strangers come with the start."""
         if kind == "goal":
-            return sample_goal(self._goal, self._catalogue, self._robot, rng)
+            self._shown = sample_goal(self._goal, self._catalogue, self._robot, rng)
+            return self._shown
         layout = sample_start(self._goal, self._catalogue, self._robot, rng)
+        if self._shown and not _leaves_room(layout[TRAY], self._shown, self._goal, self._catalogue, self._robot):
+            raise Rejected("what the goal has beside the tray is out of reach there")
         for name in self._strangers:
             _add_stranger(name, layout, self._catalogue, self._robot, rng)
         return layout
@@ -221,6 +231,21 @@ def _can_be_filled(T_base_tray: Floats, goal: str, robot: Robot) -> bool:
     return all(_reachable(T_base_tray @ pose(np.eye(3), np.array([spot.x, spot.y, 0.0])), robot) for spot in spots)
 
 
+def _leaves_room(T_base_tray: Floats, shown: Layout, goal: str, catalogue: Catalogue, robot: Robot) -> bool:
+    """Whether what stood beside the tray when the goal was shown is in reach beside the tray as it is now."""
+    standing = {spot.name for spot in GOALS[goal] if spot.support == "table"}
+    beside, pending = set[str](), [TRAY]
+    while pending:
+        one = pending.pop()
+        near = {name for name in standing - beside if name != one and _gap(one, name, shown, catalogue) < _BESIDE}
+        beside |= near
+        pending += near
+    return any(
+        all(_reachable(T_base_tray @ turn @ inverse(shown[TRAY]) @ shown[name], robot, _REGION) for name in beside)
+        for turn in catalogue[TRAY].symmetries.transforms()
+    )
+
+
 def _wrong_stack(goal: str, catalogue: Catalogue, rng: np.random.Generator) -> tuple[str, str] | None:
     """An (upper, lower) pair that stands safely and is not in the goal, or None."""
     wanted = {(spot.name, spot.support) for spot in GOALS[goal]}
@@ -291,9 +316,10 @@ def _is_seen(layout: Layout, catalogue: Catalogue, robot: Robot) -> bool:
     return is_seen(robot, [(catalogue[name], T) for name, T in layout.items() if name != TRAY])
 
 
-def _reachable(T: Floats, robot: Robot) -> bool:
+def _reachable(T: Floats, robot: Robot, slack: float = 0.0) -> bool:
     x = T[0, 3] - shift(robot)[0]
-    return bool(np.linalg.norm(T[:2, 3] - robot.shoulder) <= robot.reach and _NEAR <= x <= _FAR)
+    near = np.linalg.norm(T[:2, 3] - robot.shoulder) <= robot.reach + slack
+    return bool(near and _NEAR - slack <= x <= _FAR + slack)
 
 
 def _gap(a: str, b: str, layout: Layout, catalogue: Catalogue) -> float:

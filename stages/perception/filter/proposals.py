@@ -18,9 +18,10 @@ from stages.geometry.poses import (
     random_rotations,
     rotate,
     symmetry_angle,
+    turned_within,
 )
 from stages.perception.rendering.rasteriser import KERNEL
-from stages.scene.catalogue import CatalogueObject
+from stages.scene.catalogue import CatalogueObject, Mesh
 
 Dof = Literal[3, 6]
 _SAME = np.deg2rad(12.0)
@@ -29,6 +30,14 @@ _FACES = 24
 _ROUGHLY = 0.1
 """Normals that differ by less belong to one face."""
 _CLEARLY = 0.88
+_ROUND = 0.7
+"""Share of the sides' area whose normals meet one axis (within ``_MEETING`` of the object's size), from which on a body
+is round, whatever handle it has."""
+_MEETING = 0.03
+_ROUNDS = 10
+_UPRIGHT = 0.9
+"""Share of a triangle's area, seen from the side, that makes it one of the sides."""
+_BODY_TURNS = np.deg2rad(np.arange(20.0, 360.0, 20.0))
 _RESTING = 0.5
 """Share of the first guesses in which the object rests on the plane, where it need not."""
 
@@ -64,6 +73,7 @@ class Proposals:
         """Whether every second flip is a turn by any angle about one of the axes."""
         turns = compose(compose(self.axes, cube_rotations()), self.axes.T)
         self._flips = self._distinct(np.concatenate([turns, item.symmetries.near[:, :3, :3]]))
+        self._body_turns = self._turns_of_body(item.mesh)
 
     def initial(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
         """First guesses: a reading inside the box is laid on the surface of the turned object."""
@@ -129,10 +139,11 @@ class Proposals:
         return exp_so3(_YAWS[:, None] * np.array([0.0, 0.0, 1.0])) if self.dof == 3 else self._flips
 
     def all_flips(self, pose: Floats, T_camera_table: Floats) -> Floats:
-        """Every flip of one pose, itself first, F x 3 x 4."""
+        """Every flip of one pose, itself first, and turns of a round body that has a handle, F x 3 x 4."""
         flips = self._flip_turns(pose[None], T_camera_table)[0]
         repeated = np.repeat(pose[None], len(flips), 0)
-        return np.concatenate([pose[None], self._turned(repeated, flips, np.zeros(3))])
+        flipped = self._turned(repeated, flips, np.zeros(3))
+        return np.concatenate([pose[None], flipped, turned_within(pose[None], self._body_turns)[0]])
 
     def _flip_turns(self, poses: Floats, T_camera_table: Floats) -> Floats:
         """Rotations in the camera frame that flip each pose, P x F x 3 x 3."""
@@ -156,6 +167,21 @@ class Proposals:
             if all(symmetry_angle(other, R, self._symmetries) > _SAME for other in known):
                 kept.append(R)
         return np.stack(kept) if kept else exp_so3(np.pi * np.eye(3)[:1])
+
+    def _turns_of_body(self, mesh: Mesh) -> Floats:
+        """Turns about the axis of a round body in the object's frame, B x 3 x 4, none where it is wholly symmetric.
+
+        Where something hides a mug's handle, it may be anywhere behind: flips are too far apart to find it.
+        """
+        none = np.empty((0, 3, 4))
+        found = round_body(mesh, self.axes)
+        if found is None:
+            return none
+        axis, point = found
+        R = exp_so3(_BODY_TURNS[:, None] * axis)
+        if (symmetry_angle(np.eye(3), R, self._symmetries) < _SAME).any():
+            return none
+        return np.concatenate([R, (point - rotate(R, point))[..., None]], -1)
 
     def _rotations(
         self, guess: Guess, count: int, rng: np.random.Generator, *, resting_share: float = _RESTING
@@ -218,6 +244,47 @@ def box_axes(vertices: Floats) -> Floats:
     volumes = (along.max(1) - along.min(1)).prod(1)
     best = int(np.argmin(volumes))
     return frames[best] if volumes[best] < _CLEARLY * volumes[0] else frames[0]
+
+
+def round_body(mesh: Mesh, axes: Floats) -> tuple[Floats, Floats] | None:
+    """The axis about which most of a mesh is round, and a point of it; None where it is not round.
+
+    Normals of a surface of revolution meet its axis. ``axes`` are the directions that are tried, columns, 3 x 3. The
+    point is found by least squares, again and again over the half of the sides that is nearest to it.
+    """
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.sqrt((across**2).sum(1))
+    middles, size = corners.mean(1), float(np.ptp(mesh.vertices, axis=0).max())
+    best, found = _ROUND, None
+    for k in range(3):
+        u, v = axes[:, (k + 1) % 3], axes[:, (k + 2) % 3]
+        # Across the axis, a side's normal is a line through its middle.
+        x, y = (across * u).sum(1), (across * v).sum(1)
+        length = np.sqrt(x**2 + y**2)
+        sides = length > _UPRIGHT * areas
+        weights, tangents = areas[sides], np.stack([-y, x], -1)[sides] / length[sides, None]
+        offsets = tangents[:, 0] * (middles[sides] * u).sum(1) + tangents[:, 1] * (middles[sides] * v).sum(1)
+        centre, share = _meeting_point(tangents, offsets, weights, _MEETING * size)
+        if share > best:
+            best, found = share, (axes[:, k], centre[0] * u + centre[1] * v)
+    return found
+
+
+def _meeting_point(normals: Floats, offsets: Floats, weights: Floats, tolerance: float) -> tuple[Floats, float]:
+    """The point where lines of a plane meet (``normals`` N x 2 times the point are ``offsets``), and the share of their
+    weights that does: least squares, again and again over the half that is nearest."""
+    centre, share = np.zeros(2), 0.0
+    near = np.ones(len(offsets), bool)
+    for _ in range(_ROUNDS):
+        n, w = normals[near], weights[near]
+        A = (w[:, None, None] * n[:, :, None] * n[:, None, :]).sum(0)
+        if np.linalg.det(A) <= 1e-6 * np.trace(A) ** 2:  # parallel, or none
+            break
+        centre = np.linalg.solve(A, (w[:, None] * n * offsets[near, None]).sum(0))
+        away = np.abs((normals * centre).sum(1) - offsets)
+        near, share = away <= np.median(away), float(weights[away < tolerance].sum() / weights.sum())
+    return centre, share
 
 
 def _larger_faces(vertices: Floats, hull: ConvexHull) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import compose, rotate, rotation_angle, symmetry_angle
+from stages.geometry.poses import rotation_angle, symmetry_angle, turned_within
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.particle_filter import Rectangle
 from stages.perception.filter.proposals import Dof, Proposals
@@ -263,7 +263,7 @@ class _Joint:
         """Moves an object to the likeliest of its flips and symmetric turns; whether its shape moved."""
         place = self._place(i)
         poses, odds = self._contenders(i, place)
-        faced = _turned(poses, self._models[i].turns)
+        faced = turned_within(poses, self._models[i].turns)
         ups = faced[:, :, :3, 2] @ self._scene.T_camera_table[:3, 2]
         odds = odds[:, None] + self._colours(i, place, faced, rgb) - _ON_ITS_HEAD * (ups < -_UPRIGHT)
         flip, turn = divmod(int(np.argmax(odds > odds.max() - _TIE)), faced.shape[1])
@@ -293,7 +293,7 @@ class _Joint:
 
         A scanned mesh is symmetric but for some tenths of a millimetre, and by as much two flips may differ.
         """
-        turned, rows = _turned(poses, self._models[i].turns), np.arange(len(poses))[:, None]
+        turned, rows = turned_within(poses, self._models[i].turns), np.arange(len(poses))[:, None]
         costs = place.likelihood.costs(turned.reshape(-1, 3, 4)).reshape(turned.shape[:2])
         turned = turned[rows, np.argsort(costs, 1, kind="stable")[:, :_TURNS]].reshape(-1, 3, 4)
         polished = place.likelihood.refine(
@@ -308,11 +308,11 @@ class _Joint:
         """Those of the object's flips that are worth a full polish, polished."""
         settings = self._settings
         flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
-        rough = place.likelihood.refine(flips, place.directions, steps=_ROUGH, gate=2 * settings.gate)
+        rough = _improved(place, flips, steps=_ROUGH, gate=2 * settings.gate)
         slid = self._slid(i, place, rough[np.argsort(place.likelihood.costs(rough), kind="stable")[:_PROMISING]])
         most = place.likelihood.costs(self._poses[i][None]) + _HOPE * place.misfit
         promising = slid[place.likelihood.costs(slid) < most]
-        return place.likelihood.refine(promising, place.directions, steps=settings.steps, gate=settings.gate)
+        return _improved(place, promising, steps=settings.steps, gate=settings.gate)
 
     def _slid(self, i: int, place: _Place, poses: Floats) -> Floats:
         """Poses slid and turned in the image (upright objects: on the plane) where that costs less.
@@ -391,6 +391,13 @@ class _Joint:
         return i != j and a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
+def _improved(place: _Place, poses: Floats, *, steps: int, gate: float) -> Floats:
+    """Poses polished where that lowers their cost: a polish sees surfaces but no outlines."""
+    polished = place.likelihood.refine(poses, place.directions, steps=steps, gate=gate)
+    better = place.likelihood.costs(polished) < place.likelihood.costs(poses)
+    return np.where(better[:, None, None], polished, poses)
+
+
 def _distinct(poses: Floats, ranks: Floats, symmetries: Floats) -> list[int]:
     """The poses by rank, without those that equal one before modulo symmetry."""
     kept: list[int] = []
@@ -398,12 +405,6 @@ def _distinct(poses: Floats, ranks: Floats, symmetries: Floats) -> list[int]:
         if all(symmetry_angle(poses[j, :, :3], poses[k, :, :3], symmetries) > _SAME for j in kept):
             kept.append(k)
     return kept
-
-
-def _turned(poses: Floats, turns: Floats) -> Floats:
-    """Poses A x 3 x 4 after turns S x 4 x 4 in the object's own frame, A x S x 3 x 4."""
-    R, t = poses[:, None, :, :3], poses[:, None, :, 3]
-    return np.concatenate([compose(R, turns[:, :3, :3]), (rotate(R, turns[:, :3, 3]) + t)[..., None]], -1)
 
 
 def _considered(poses: Floats, odds: Floats, chosen: int) -> tuple[Considered, ...]:

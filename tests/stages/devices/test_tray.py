@@ -7,6 +7,7 @@ from runner.contract import Refused
 from stages.devices.simulation import Simulation
 from stages.devices.suites import tray
 from stages.devices.suites.placing import moved, support_height
+from stages.devices.suites.suite import Rejected
 from stages.devices.suites.tray import GOALS, Tray, look_alikes, sample_goal, sample_start
 from stages.devices.tabletop import Layout
 from stages.robots import Robot
@@ -57,6 +58,7 @@ def test_strangers_come_with_the_start_stand_and_leave_the_others_where_the_seed
     for seed in range(3):
         world, plain = (Tray(catalogue(), ROBOT, seed, goal, strangers) for strangers in (3, 0))
         shown = world.sample("goal", np.random.default_rng(seed))
+        plain.sample("goal", np.random.default_rng(seed))
         start, without = (suite.sample("start", np.random.default_rng(seed)) for suite in (world, plain))
         strangers = set(world.names) - set(plain.names)
         assert len(strangers) == 3 and set(start) - set(without) == strangers and not strangers & set(shown)
@@ -99,3 +101,11 @@ def test_what_is_moved_is_put_down_on_what_is_below_and_never_beside_the_table()
         assert can[2, 2] > 0.999
     with pytest.raises(Refused, match=r"x=0\.2 y=0: beside the table; valid: 0\.45 to 1\.15 and -0\.6 to 0\.6"):
         moved("tuna_can", (0.2, 0.0), layout, objects, TABLE)
+
+
+def test_what_the_goal_has_beside_the_tray_has_room_beside_it_at_the_start() -> None:
+    world = Tray(catalogue(), ROBOT, 420, "tea", 3)
+    world.sample("goal", np.random.default_rng([420, 0]))
+    # The sugar box stood near the table's front edge; the tray, turned by 25 degrees, would have it over that edge.
+    with pytest.raises(Rejected, match="what the goal has beside the tray is out of reach there"):
+        world.sample("start", np.random.default_rng([420, 1]))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.geometry.poses import compose, exp_so3, rotate, rotation_angle
-from stages.perception.filter.proposals import Guess, Proposals, box_axes, distinct_best
+from stages.perception.filter.proposals import Guess, Proposals, box_axes, distinct_best, round_body
 from tests.stages.perception.scenes import CATALOGUE, camera
 
 TABLE = camera()
@@ -69,6 +69,27 @@ def test_flips_keep_the_centre_and_differ_from_one_another_modulo_symmetry() -> 
                                                                                    (len(flips), 1)))  # fmt: skip
     angles = rotation_angle(flips[:, None, :, :3], flips[None, :, :, :3])
     assert angles[~np.eye(len(flips), dtype=bool)].min() > np.deg2rad(12)
+
+
+def test_a_mug_is_round_but_for_its_handle_and_turns_about_its_body() -> None:
+    found = round_body(CATALOGUE["mug"].mesh, np.eye(3))
+    assert found is not None
+    assert found[0] == pytest.approx([0, 0, 1]) and found[1] == pytest.approx([-0.0153, 0, 0], abs=0.001)
+    assert all(round_body(CATALOGUE[label].mesh, np.eye(3)) is None for label in ("tea_box", "milk_carton", "sponge"))
+    pose = np.concatenate([exp_so3(np.array([0.3, 0.2, 0.1])), [[0.1], [0.0], [0.8]]], 1)
+    turns = Proposals(CATALOGUE["mug"], 6).all_flips(pose, TABLE)[-17:]
+    assert turns[:, :, 2] == pytest.approx(np.tile(pose[:, 2], (17, 1)))
+    axis = rotate(pose[None, :, :3], found[1])[0] + pose[:, 3]
+    assert rotate(turns[:, :, :3], found[1]) + turns[:, :, 3] == pytest.approx(np.tile(axis, (17, 1)))
+    degrees = np.rad2deg(rotation_angle(turns[:, :, :3], pose[:, :3]))
+    assert np.sort(degrees) == pytest.approx([*np.repeat(np.arange(20, 180, 20), 2), 180])
+
+
+def test_what_looks_the_same_all_around_is_not_turned() -> None:
+    pose = np.concatenate([np.eye(3), [[0.1], [0.0], [0.8]]], 1)
+    for label in ("soup_can", "cup", "bowl"):
+        proposals = Proposals(CATALOGUE[label], 6)
+        assert len(proposals.all_flips(pose, TABLE)) == 1 + len(proposals.flips)
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(1, 12))

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3, pose, symmetry_angle
+from stages.geometry.poses import exp_so3, pose, rotate, symmetry_angle
 from stages.perception.filter.settings import FilterSettings
 from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
@@ -25,6 +25,8 @@ OVER = pose(exp_so3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
 STAYS = np.eye(4)
 NUDGE = pose(exp_so3(np.array([0.02, -0.02, 0.02])), np.array([0.003, -0.002, 0.003]))
 SPIN = CATALOGUE["soup_can"].symmetries.transforms()
+AXIS = np.array([-0.0153, 0.0, 0.0])
+"""Where the mug's body has its axis."""
 PLAIN = {
     label: replace(item, mesh=replace(item.mesh, colors=np.full_like(item.mesh.colors, (180, 40, 30))))
     for label, item in CATALOGUE.objects.items()
@@ -97,6 +99,22 @@ def test_without_colour_depth_stands(seen: Rendered, why: str) -> None:
     settings = RefinementSettings(colour=why != "switched off")
     found = SceneRefiner(catalogue, settings).refine(seen.scene, 0 * rgb if why == "no image" else rgb, nudged(seen))
     assert turned(found, seen)[0] < 3
+
+
+@pytest.mark.parametrize(("yaw", "degrees"), [(0.6, 160), (1.2, -100), (1.9, 160)])
+def test_a_mug_whose_handle_is_out_of_sight_is_turned_as_its_label_says(
+    refiner: SceneRefiner, yaw: float, degrees: float
+) -> None:
+    mug = render({"mug": upright("mug", 0.0, 0.04, yaw), "cup": upright("cup", 0.03, -0.05, 0.0)})
+    axis = rotate(mug.poses["mug"][None, :3, :3], AXIS)[0] + mug.poses["mug"][:3, 3]
+    false = pose(exp_so3(np.array([0.0, 0.0, np.deg2rad(degrees)])), np.zeros(3))
+    false[:3, 3] = AXIS - false[:3, :3] @ AXIS
+    rgb = painted([(CATALOGUE[label].mesh, T) for label, T in mug.poses.items()], VIEW)
+    placed = [Placed("mug", mug.poses["mug"] @ false), Placed("cup", mug.poses["cup"])]
+    found = refiner.refine(mug.scene, rgb, placed)
+    assert turned(found, mug)[0] < 10
+    T = found.objects[0].T_camera_object
+    assert rotate(T[None, :, :3], AXIS)[0] + T[:, 3] == pytest.approx(axis, abs=0.003)
 
 
 def test_colour_does_not_overrule_depth(seen: Rendered, refiner: SceneRefiner) -> None:
