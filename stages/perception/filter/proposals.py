@@ -62,7 +62,8 @@ class Proposals:
     def __init__(self, item: CatalogueObject, dof: Dof) -> None:
         self.dof: Dof = dof
         self._centre = item.bounds.mean(0)
-        self._vertices = item.simplified(500).vertices
+        mesh = item.simplified(500)
+        self._vertices = mesh.vertices
         self._support = self._vertices[ConvexHull(self._vertices).vertices]
         # The catalogue's z axis is up when an object stands; resting poses of scanned meshes may lean a little.
         self._resting = np.eye(3)[None] if dof == 3 else np.stack([np.eye(3), *item.resting])
@@ -73,7 +74,7 @@ class Proposals:
         """Whether every second flip is a turn by any angle about one of the axes."""
         turns = compose(compose(self.axes, cube_rotations()), self.axes.T)
         self._flips = self._distinct(np.concatenate([turns, item.symmetries.near[:, :3, :3]]))
-        self._body_turns = self._turns_of_body(item.mesh)
+        self._body_turns = self._turns_of_body(mesh)
 
     def initial(self, guess: Guess, count: int, rng: np.random.Generator) -> Floats:
         """First guesses: a reading inside the box is laid on the surface of the turned object."""
@@ -249,8 +250,7 @@ def box_axes(vertices: Floats) -> Floats:
 def round_body(mesh: Mesh, axes: Floats) -> tuple[Floats, Floats] | None:
     """The axis about which most of a mesh is round, and a point of it; None where it is not round.
 
-    Normals of a surface of revolution meet its axis. ``axes`` are the directions that are tried, columns, 3 x 3. The
-    point is found by least squares, again and again over the half of the sides that is nearest to it.
+    Normals of a surface of revolution meet its axis. ``axes`` are the directions that are tried, columns, 3 x 3.
     """
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
