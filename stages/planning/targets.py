@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, takewhile
 from math import hypot
@@ -43,6 +43,9 @@ FEWEST = 4
 """Poses offered for a transfer of which only late ones are within reach."""
 BRANCHES, TRIES = 4, 80
 """Places of one step from which is gone on, and how many in all before each step has but one."""
+
+FOLLOWED = 6
+"""Places of what something goes beside for which is asked whether that can follow."""
 
 BEYOND = 1.0
 """Cost of a place outside the area in which the robot places: the hand may get there, as it does not everywhere."""
@@ -180,7 +183,7 @@ class Targets:
         options = self._options(step, rest, scene, again)
         if isinstance(options, Blocked):
             return options
-        number = next(options.handled.places(), None)
+        number = next(self._tried(step, options, rest, scene), None)
         if number is None:
             return _trouble(step, options, None)
         chosen = options.places[number]
@@ -203,7 +206,7 @@ class Targets:
         if isinstance(options, Blocked):
             return options
         places, failed = options.places, None
-        for number in islice(options.handled.places(), BRANCHES if self._tries > 0 else 1):
+        for number in islice(self._tried(step, options, rest, scene), BRANCHES if self._tries > 0 else 1):
             self._tries -= 1
             if step.item not in late and self._crowds(places[number], rest, scene):
                 return Crowded(step)
@@ -255,6 +258,29 @@ class Targets:
             self._known[key] = Options(places, handled, blocked) if handled else blocked
         return self._known[key]
 
+    def _tried(self, step: Step, options: Options, rest: Sequence[Step], scene: Scene) -> Iterator[int]:
+        """Numbers of places that the hand reaches: those where what goes beside the object follows, first."""
+        children = [other for other in rest if other.parent == step.item]
+        late: list[int] = []
+        for number in islice(options.handled.places(), FOLLOWED if children else None):
+            after = scene.after(step.item, options.places[number], step.destination)
+            if all(self._follows(child, step.item, after) for child in children):
+                yield number
+            else:
+                late.append(number)
+        yield from late
+
+    def _follows(self, child: Step, parent: str, scene: Scene) -> bool:
+        """Whether a step can be done once its parent is where it is, at least after others have moved."""
+        options = self._options(child, (), scene, again=False)
+        if isinstance(options, Options):
+            if next(options.handled.places(), None) is not None:
+                return True
+            obstacles = options.handled.why_not()[1]
+        else:
+            obstacles = options.obstacles
+        return bool(obstacles) and parent not in obstacles and _effort(obstacles, scene)[0] == 0
+
     def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
         pending = {after.item for after in rest} - {item.name}
         return any(_is_near(item, scene.standing[name], CROWDED) for name in pending)
@@ -262,11 +288,14 @@ class Targets:
     def _goal_poses(self, step: Step, scene: Scene, enough: int) -> Found:
         """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle.
 
+        On the table always with a margin, of which less is enough at the edge where a region leaves no other place.
         As many places as are ``enough``, or all that there are.
         """
         placements = self._placements.of(step, scene)
         placements = self._seen_first(placements, step, scene) if step.region else placements
-        margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
+        workspace, margins = self._workspace, (self._workspace.clearance, 0.0, None)
+        if step.destination == TABLE:
+            margins = (workspace.edge, workspace.clearance) if step.region else (workspace.edge,)
         if step.destination != TABLE and _fits(scene.standing[step.item], scene.standing[step.destination]):
             margins = margins[:2]
         found: Found = [], ()
@@ -321,15 +350,13 @@ class Targets:
         return valid + beyond[: self._workspace.targets], blocking
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
-        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
-
-        The table always carries all of it, not far beyond where the arm is known to reach.
-        """
+        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle; the table
+        not far beyond where the arm is known to reach."""
         if destination == TABLE:
             T_base_object = scene.T_base_table @ item.T_table_object
             distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
             within_reach = self._workspace.outside(T_base_object) == 0 and distance < self._robot.reach + FARTHER
-            return within_reach and self._on_table(item, scene)
+            return within_reach and _on_table(item, scene, margin or 0.0)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
         if margin is not None:
@@ -338,22 +365,17 @@ class Targets:
         depth, deepest = regions.depth(surface, middles)
         return bool(depth >= min(MIDDLE, 0.5 * deepest))
 
-    def _on_table(self, item: Standing, scene: Scene) -> bool:
-        """Whether all of an object, seen from above, lies over the table and away from its edge."""
-        surface = scene.surface
-        return surface is None or regions.inside(item.outline, surface, margin=self._workspace.edge)
-
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
         """Places on the table, near and with space around them, where nothing of the goal will stand."""
         item = scene.standing[step.item]
         others = scene.others(step.item, TABLE)
         reserved = [
-            next((place for place in places if self._supported(place, TABLE, scene, None)), places[0])
+            next((place for place in places if self._supported(place, TABLE, scene, self._workspace.edge)), places[0])
             for places in self._placements.reserved(pending, scene)
         ]
         spots: list[Placement] = []
         for spot in self._grid(item, scene):
-            if not self._on_table(spot, scene):
+            if not _on_table(spot, scene, self._workspace.edge):
                 continue
             room = min((_clearance(spot, other) for other in others), default=np.inf)
             free = min((regions.separation(spot.outline, other.outline) for other in reserved), default=np.inf)
@@ -407,6 +429,11 @@ def neighbours(name: str, scene: Scene) -> list[str]:
     item = scene.standing[name]
     gaps = {other.name: _clearance(item, other) for other in scene.others(name, scene.supports[name])}
     return sorted((other for other in gaps if gaps[other] < CROWDED), key=lambda other: gaps[other])
+
+
+def _on_table(item: Standing, scene: Scene, margin: float) -> bool:
+    """Whether all of an object, seen from above, lies over the table, ``margin`` metres from its edge."""
+    return scene.surface is None or regions.inside(item.outline, scene.surface, margin=margin)
 
 
 def _alike(a: Standing, b: Standing, metres: float) -> bool:

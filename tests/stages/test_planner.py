@@ -15,8 +15,12 @@ from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
 from stages.messages.scene import Side, UnknownRegion
 from stages.planner import Planner
+from stages.planning.handling import Handling
+from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
-from stages.planning.targets import Workspace
+from stages.planning.symbolic.problem import TABLE
+from stages.planning.symbolic.search import Step
+from stages.planning.targets import Next, Targets, Workspace
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
@@ -71,7 +75,7 @@ def over_the_edge(found: Plan, surface: regions.Region) -> list[str]:
         kind = stances(label_of(transfer.object))
         placed = [Standing.at(transfer.object, kind, inverse(T_BASE_TABLE) @ T) for T in transfer.T_base_targets]
         if transfer.destination == "table" and not all(
-            regions.inside(item.outline, surface, margin=Workspace().edge) for item in placed
+            regions.inside(item.outline, surface, margin=Workspace().clearance) for item in placed
         ):
             names.append(transfer.key)
     return names
@@ -604,6 +608,21 @@ STRANGER_BETWEEN = (
 """A sugar box that is in no goal stands where the bowl belongs; wherever it goes first, the tea box lacks a place."""
 
 
+AROUND_A_TRAY = (
+    Layout()
+    .put("tray", 0.1533, 0.0520, yaw=0.381)
+    .put("milk_carton", 0.0496, 0.2225, yaw=1.850)
+    .put("sponge", 0.0765, 0.3367, yaw=-0.068)
+)
+NEAR_A_CORNER = (
+    Layout()
+    .put("tray", 0.1417, 0.1931, yaw=-2.590)
+    .put("milk_carton", -0.0850, 0.3201, yaw=1.551)
+    .put("sponge", 0.0019, -0.1019, yaw=-0.161)
+)
+"""Where the carton was shown to be beside the tray, the hand does not get down to the sponge's place any more."""
+
+
 def restored(goal: Layout, start: Layout, *, which: int) -> tuple[list[str], Layout]:
     """Transfers until nothing is left to do, each to its target number ``which`` (or its last), and the scene then."""
     keys, then, at = list[str](), (), start
@@ -639,6 +658,21 @@ def test_what_was_put_where_a_later_object_lacks_the_room_is_put_elsewhere():
     assert not any("plans one transfer after the other" in line for line in context.lines)
     assert found.transfers[0].key == "sugar_box: table -> table" and len(found.transfers) <= 7
     assert reached(NEAR_A_BOWL, executed(STRANGER_BETWEEN, found))
+
+
+def test_what_something_goes_beside_is_put_where_that_can_follow():
+    goal, known = AROUND_A_TRAY.graph(), {label: stances(label) for label in ("tray", "milk_carton", "sponge")}
+    corner = np.array(
+        [(-0.15, 0.464), (-0.146, -0.416), (0.445, -0.603), (0.555, -0.592), (0.549, 0.598), (0.219, 0.586)]
+    )
+    scene = Scene.of(msgspec.structs.replace(NEAR_A_CORNER.graph(), support=np.array(corner)), known)
+    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
+    targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, dict.fromkeys(known, TABLE))
+    carton = Step("milk_carton", TABLE, TABLE, "milk_carton_near_tray", "tray")
+    sponge = Step("sponge", TABLE, TABLE, "sponge_near_milk_carton", "milk_carton")
+    first = targets.next(carton, [sponge], scene, again=False, late=True)
+    assert isinstance(first, Next)
+    assert isinstance(targets.next(sponge, [], first.scene, again=False, late=True), Next)
 
 
 @pytest.mark.parametrize("which", [0, 3, 11])
