@@ -288,14 +288,11 @@ class Targets:
     def _goal_poses(self, step: Step, scene: Scene, enough: int) -> Found:
         """Where the object stands wholly on what carries it, with a margin or at least without; else by its middle.
 
-        On the table always with a margin, of which less is enough at the edge where a region leaves no other place.
         As many places as are ``enough``, or all that there are.
         """
         placements = self._placements.of(step, scene)
         placements = self._seen_first(placements, step, scene) if step.region else placements
-        workspace, margins = self._workspace, (self._workspace.clearance, 0.0, None)
-        if step.destination == TABLE:
-            margins = (workspace.edge, workspace.clearance) if step.region else (workspace.edge,)
+        margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
         if step.destination != TABLE and _fits(scene.standing[step.item], scene.standing[step.destination]):
             margins = margins[:2]
         found: Found = [], ()
@@ -350,13 +347,15 @@ class Targets:
         return valid + beyond[: self._workspace.targets], blocking
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
-        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle; the table
-        not far beyond where the arm is known to reach."""
+        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
+
+        The table always carries all of it, not far beyond where the arm is known to reach.
+        """
         if destination == TABLE:
             T_base_object = scene.T_base_table @ item.T_table_object
             distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
             within_reach = self._workspace.outside(T_base_object) == 0 and distance < self._robot.reach + FARTHER
-            return within_reach and _on_table(item, scene, margin or 0.0)
+            return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
         if margin is not None:
@@ -365,17 +364,22 @@ class Targets:
         depth, deepest = regions.depth(surface, middles)
         return bool(depth >= min(MIDDLE, 0.5 * deepest))
 
+    def _on_table(self, item: Standing, scene: Scene) -> bool:
+        """Whether all of an object, seen from above, lies over the table and away from its edge."""
+        surface = scene.surface
+        return surface is None or regions.inside(item.outline, surface, margin=self._workspace.edge)
+
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
         """Places on the table, near and with space around them, where nothing of the goal will stand."""
         item = scene.standing[step.item]
         others = scene.others(step.item, TABLE)
         reserved = [
-            next((place for place in places if self._supported(place, TABLE, scene, self._workspace.edge)), places[0])
+            next((place for place in places if self._supported(place, TABLE, scene, None)), places[0])
             for places in self._placements.reserved(pending, scene)
         ]
         spots: list[Placement] = []
         for spot in self._grid(item, scene):
-            if not _on_table(spot, scene, self._workspace.edge):
+            if not self._on_table(spot, scene):
                 continue
             room = min((_clearance(spot, other) for other in others), default=np.inf)
             free = min((regions.separation(spot.outline, other.outline) for other in reserved), default=np.inf)
@@ -429,11 +433,6 @@ def neighbours(name: str, scene: Scene) -> list[str]:
     item = scene.standing[name]
     gaps = {other.name: _clearance(item, other) for other in scene.others(name, scene.supports[name])}
     return sorted((other for other in gaps if gaps[other] < CROWDED), key=lambda other: gaps[other])
-
-
-def _on_table(item: Standing, scene: Scene, margin: float) -> bool:
-    """Whether all of an object, seen from above, lies over the table, ``margin`` metres from its edge."""
-    return scene.surface is None or regions.inside(item.outline, scene.surface, margin=margin)
 
 
 def _alike(a: Standing, b: Standing, metres: float) -> bool:

@@ -75,7 +75,7 @@ def over_the_edge(found: Plan, surface: regions.Region) -> list[str]:
         kind = stances(label_of(transfer.object))
         placed = [Standing.at(transfer.object, kind, inverse(T_BASE_TABLE) @ T) for T in transfer.T_base_targets]
         if transfer.destination == "table" and not all(
-            regions.inside(item.outline, surface, margin=Workspace().clearance) for item in placed
+            regions.inside(item.outline, surface, margin=Workspace().edge) for item in placed
         ):
             names.append(transfer.key)
     return names
@@ -665,7 +665,7 @@ def test_what_something_goes_beside_is_put_where_that_can_follow():
     corner = np.array(
         [(-0.15, 0.464), (-0.146, -0.416), (0.445, -0.603), (0.555, -0.592), (0.549, 0.598), (0.219, 0.586)]
     )
-    scene = Scene.of(msgspec.structs.replace(NEAR_A_CORNER.graph(), support=np.array(corner)), known)
+    scene = Scene.of(msgspec.structs.replace(NEAR_A_CORNER.graph(), support=corner), known)
     handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
     targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, dict.fromkeys(known, TABLE))
     carton = Step("milk_carton", TABLE, TABLE, "milk_carton_near_tray", "tray")

@@ -22,6 +22,8 @@ from stages.scene.stance import Stances, Standing, yawed
 
 BESIDE = 0.06
 """Metres between the footprints of objects that stand beside each other, at most."""
+SEEN_BESIDE = BESIDE + 0.01
+"""The same of objects that may be seen as standing so: perception may find them nearer to each other than they are."""
 APART = 0.008
 """Metres between footprints, at least: less and objects touch while they settle."""
 _MARGIN = 0.02
@@ -33,8 +35,6 @@ _BEYOND = 0.03
 _TRIES = 30
 _HIGHEST = 3
 """Objects in a stack."""
-_NOISE = 0.01
-"""Metres by which perception may find objects nearer to each other than they are."""
 _TURN = np.deg2rad(22.5)
 """Between the turns of what is round at which is tried whether there is room beside it."""
 
@@ -154,7 +154,7 @@ class Draft:
                 if self.supports[other.name] == one
                 or (
                     self.supports[other.name] == self.supports[one]
-                    and regions.gap(other.outline, self.placed[one].outline) < BESIDE + _NOISE
+                    and regions.gap(other.outline, self.placed[one].outline) < SEEN_BESIDE
                 )
             } - found
             found |= new

@@ -9,7 +9,7 @@ from itertools import combinations, permutations
 import numpy as np
 
 from runner.contract import Refused
-from stages.devices.suites.draft import BESIDE
+from stages.devices.suites.draft import SEEN_BESIDE
 from stages.devices.suites.placing import support_height, upright
 from stages.devices.suites.suite import Kind, Rejected, Suite, graspable, shift
 from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
@@ -24,8 +24,6 @@ _NEAR, _FAR = 0.52, 0.80
 """Metres ahead between which objects stand."""
 _APART = 0.04
 """Metres between objects that are not placed together: room for a finger."""
-_BESIDE = BESIDE + 0.01
-"""Gap between objects below which they may be seen as standing beside each other, metres."""
 _REGION = 0.03
 """Metres beside the place that was shown where an object may stand as well."""
 _EDGE = 0.08
@@ -237,7 +235,7 @@ def _leaves_room(T_base_tray: Floats, shown: Layout, goal: str, catalogue: Catal
     beside, pending = set[str](), [TRAY]
     while pending:
         one = pending.pop()
-        near = {name for name in standing - beside if name != one and _gap(one, name, shown, catalogue) < _BESIDE}
+        near = {name for name in standing - beside if _gap(one, name, shown, catalogue) < SEEN_BESIDE}
         beside |= near
         pending += near
     return any(
