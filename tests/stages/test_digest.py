@@ -312,6 +312,28 @@ def test_what_carries_something_is_found_by_the_gap_below_it(filter_stage: Parti
     assert {item.label for item in estimate.objects} == {"tuna_can", "tea_box"}
 
 
+@pytest.mark.parametrize(
+    ("x", "y", "yaw"), [(0.003, -0.0055, -2.75), (-0.0057, -0.0048, 1.89), (-0.0042, 0.0117, -1.09)]
+)
+def test_what_covers_the_readings_but_fits_worse_than_the_others_gives_way_to_what_the_scene_suggests(
+    x: float, y: float, yaw: float, filter_stage: ParticleFilter
+) -> None:
+    """The can that carries a box, in one box with it: another box through the first one covers the can, too."""
+    box = upright("sugar_box", x, y, yaw)
+    box[2, 3] += 0.04
+    scene = {"sugar_box": box, "tuna_can": upright("tuna_can", 0.0, 0.0, 0.0)}
+    scene |= {"cup": upright("cup", -0.2, 0.15, 0.0), "salt_shaker": upright("salt_shaker", -0.15, -0.03, 0.0)}
+    seen = render(scene)
+    (x0, y0, x1, y1), (left, _, right, bottom) = seen.boxes["sugar_box"], seen.boxes["tuna_can"]
+    both_in_part = np.array([min(x0, left), y0, max(x1, right), (y1 + bottom) / 2])
+    boxes = seen.boxes | {"sugar_box": both_in_part}
+    found = candidates(*((label, boxes[label], 0.95) for label in scene if label != "tuna_can"))
+    config = Hypotheses.Config(n_objects="auto", suggestions=True)
+    (observation, *hypotheses), _ = enumerate_(config, frame(seen), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert sorted(item.label for item in estimate.objects) == sorted(scene)
+
+
 def test_an_empty_table_has_no_objects(seen: Rendered, filter_stage: ParticleFilter) -> None:
     bare = render({})
     found = candidates(("mug", seen.boxes["mug"], 0.9))

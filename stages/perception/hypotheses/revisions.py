@@ -70,14 +70,24 @@ def relabelled(best: Posterior, offers: Sequence[Offer], before: Sequence[float]
 
 
 def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
-    """Revisions in which the object that fits worst has another label: it may cover readings without being alike."""
+    """Revisions in which the object that fits worst gives way to one by another label: it may cover readings without
+    being alike.
+
+    The other label is one of its box; where it shares that with another object, also one of a box that shows the same.
+    """
     if len(best.objects) < 2:
         return []
     *others, worst = sorted(best.objects, key=lambda item: item.cost)
     if worst.cost < _MISFIT * np.median([item.cost for item in others]):
         return []
-    doubted = offers[_index(worst, offers)]
-    return _instead(best, offers, [k for k, offer in enumerate(offers) if _same_box(offer, doubted)])
+    kept, chosen = tuple(i for i, item in enumerate(best.objects) if item is not worst), _chosen(best, offers)
+    doubled = any(np.array_equal(item.box, worst.box) for item in others)
+    boxes = {k: offer.candidate.box for k, offer in enumerate(offers) if offer.instead and k not in chosen}
+    return [
+        Revision(kept, (k,))
+        for k, box in boxes.items()
+        if np.array_equal(box, worst.box) or (doubled and shared(box, worst.box) > SHARED)
+    ]
 
 
 def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
