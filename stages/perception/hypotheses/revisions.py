@@ -66,7 +66,13 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
 def relabelled(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
     """Revisions in which what a box leaves unexplained is an object by another label, in the place of the one that came
     from that box, if there is any; as :func:`revisions`."""
-    return _instead(best, offers, _left_open(best, before))
+    chosen = _chosen(best, offers)
+    instead = [k for k in _left_open(best, before) if offers[k].instead and k not in chosen]
+    taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
+    return [
+        Revision(tuple(i for i in range(len(best.objects)) if i not in gone), (k,))
+        for k, gone in zip(instead, taken, strict=True)
+    ]
 
 
 def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
@@ -110,17 +116,6 @@ def new_offers(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Of
 def is_better(log_weight: float, known: float) -> bool:
     """Whether a scene saves enough of what the best one before costs."""
     return log_weight > (1 - _GAIN) * known
-
-
-def _instead(best: Posterior, offers: Sequence[Offer], among: Sequence[int]) -> list[Revision]:
-    """Less likely labels among some offers, each in the place of the object that came from its box."""
-    chosen = _chosen(best, offers)
-    instead = [k for k in among if offers[k].instead and k not in chosen]
-    taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
-    return [
-        Revision(tuple(i for i in range(len(best.objects)) if i not in gone), (k,))
-        for k, gone in zip(instead, taken, strict=True)
-    ]
 
 
 def _chosen(best: Posterior, offers: Sequence[Offer]) -> dict[int, int]:
