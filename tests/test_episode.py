@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.robot.pictures import sheet, views
 from runner.message.codec import pack
 from runner.recording.recording import Recording
 from tests.runner.transport.test_bad_input import public_address, stranger
@@ -62,6 +63,9 @@ def test_a_scene_is_restored_though_a_particle_filter_is_killed_and_replays_to_t
     assert "particle_filter" in report.read_text().split("restarts")[1]
     for name in ("domain.pddl", "goal-breakfast.pddl", "problem-01.pddl"):
         assert (report.parent / name).is_file()
+    seen = views(recording)
+    assert list(seen) == ["goal", "start", "middle", "end"] and len({rgb.tobytes() for rgb in seen.values()}) == 4
+    assert sheet([list(seen.items())] * 2).size == (4 * 320, 2 * 240)
     replay = subprocess.run(
         (*RUNNER, "replay", str(recording), "--verify"), cwd=ROOT, capture_output=True, text=True, check=False
     )

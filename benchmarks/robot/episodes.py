@@ -56,7 +56,8 @@ class Episode:
             "objects_lost": len(losses),
             "objects_lost_unsaid": sum(not loss.said for loss in losses),
             "transfers": len(self.outcomes),
-            "robot_seconds": round(sum(one.robot_seconds for one in (*self.outcomes, *self.corrections)), 2),
+            "relations_regained": len(judgement.regained),
+            "robot_seconds": round(self.robot_seconds, 2),
             "wall_seconds": round(self.seconds, 2),
             "failing_stage": self.failing_stage,
             "refused": self.refused,
@@ -67,6 +68,11 @@ class Episode:
             "complete": self.complete,
             "recording": self.recording.name,
         }
+
+    @property
+    def robot_seconds(self) -> float:
+        """How long the arm moved, simulated seconds."""
+        return sum(one.robot_seconds for one in (*self.outcomes, *self.corrections))
 
     @property
     def failing_stage(self) -> str:
@@ -144,11 +150,14 @@ def totals(episodes: Sequence[Episode]) -> str:
     """The last line."""
     judgements = [episode.judgement for episode in episodes]
     losses = [loss for judgement in judgements for loss in judgement.losses]
+    regained = max(1, sum(len(one.regained) for one in judgements))
     return (
         f"{sum(episode.code == 0 for episode in episodes)} of {len(episodes)} restored, "
         f"{sum(episode.refused for episode in episodes)} refused before anything moved; in truth "
         f"{sum(one.restored for one in judgements)}, false successes {sum(one.false_success for one in judgements)}, "
-        f"objects lost {len(losses)}, {sum(not loss.said for loss in losses)} of them unsaid"
+        f"objects lost {len(losses)}, {sum(not loss.said for loss in losses)} of them unsaid; "
+        f"{sum(one.robot_seconds for one in episodes) / regained:.1f} robot seconds and "
+        f"{sum(one.seconds for one in episodes) / regained:.1f} wall seconds per relation regained"
     )
 
 

@@ -52,6 +52,8 @@ class Judgement:
     differences: tuple[str, ...] = ()
     """Where the verdict says something else, relation by relation."""
     losses: tuple[Loss, ...] = ()
+    regained: tuple[Assertion, ...] = ()
+    """Relations that hold at the end and did not at the start."""
 
     @property
     def restored(self) -> bool:
@@ -84,12 +86,12 @@ class Truth:
             return Judgement(verdict.success)
         shown = max(k for k, one in enumerate(snapshots) if _shows(one.purpose, goal.name))
         wanted = self._wanted(self._as_taught(snapshots[shown], goal.scene), goal.scene)
-        ends = (self._scene(final, goal.scene) for final in self._exchanged(snapshots[-1]))
-        found = [satisfied(wanted, end, self._catalogue, share=1.0) for end in ends]
-        held, violated = min(found, key=lambda relations: len(relations[1]))
+        held, violated = self._satisfied(wanted, snapshots[-1])
+        lacking = self._satisfied(wanted, snapshots[min(shown + 1, len(snapshots) - 1)])[1]
         return Judgement(
             verdict.success, held, violated, _differences(held, violated, verdict),
             self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes), {one.object for one in outcomes}),
+            tuple(each for each in held if each in lacking),
         )  # fmt: skip
 
     def _as_taught(self, shown: Snapshot, taught: SceneGraph) -> Snapshot:
@@ -99,11 +101,17 @@ class Truth:
         kept = [matches[k].name if k in matches else None for k in range(len(labels))]
         return msgspec.structs.replace(shown, names=tuple(unique_names(labels, kept)))
 
-    def _exchanged(self, final: Snapshot) -> Iterator[Snapshot]:
+    def _satisfied(self, wanted: SceneGraph, snapshot: Snapshot) -> tuple[tuple[Assertion, ...], tuple[Assertion, ...]]:
+        """Which of the goal's relations hold at a look and which do not."""
+        scenes = (self._scene(named, wanted) for named in self._exchanged(snapshot))
+        found = [satisfied(wanted, scene, self._catalogue, share=1.0) for scene in scenes]
+        return min(found, key=lambda relations: len(relations[1]))
+
+    def _exchanged(self, snapshot: Snapshot) -> Iterator[Snapshot]:
         """The scene with every way to name its equal objects, as it is first."""
-        labels = [label_of(name, self._catalogue) for name in final.names]
-        for names in exchanges(labels, final.names, {}):
-            yield msgspec.structs.replace(final, names=tuple(names))
+        labels = [label_of(name, self._catalogue) for name in snapshot.names]
+        for names in exchanges(labels, snapshot.names, {}):
+            yield msgspec.structs.replace(snapshot, names=tuple(names))
 
     def _scene(self, snapshot: Snapshot, taught: SceneGraph) -> SceneGraph:
         """The true scene graph; what left the table does not exist in it."""

@@ -17,22 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from PIL import Image, ImageDraw
 
 from benchmarks.common.command import command
 from benchmarks.robot.episodes import HEADER, ROOT, Episode, row, run
-from runner.message.codec import open_envelope
-from runner.recording.recording import Recording
+from benchmarks.robot.pictures import QUALITY, sheet, views
 from stages.devices.suites.tray import GOALS
-from stages.messages import Frame
 from stages.messages.arrays import Rgb
 
 _GRAPH = ROOT / "graph.yaml"
 _OBJECTS = 6
 """Of each goal, the tray among them: the experiment takes them to be known."""
 _DIGEST = ("hypotheses", "particle_filter", "ranker", "refiner")
-_WIDTH = 320
-"""Of one picture of a sheet, pixels."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +69,7 @@ def main() -> int:
         print(f"\n{experiment.title}\n\n{HEADER}")
         episodes = [_printed(run(options.first_seed + start, graph, (f"world.goal={goal}",)))
                     for goal in experiment.goals for start in range(experiment.starts)]  # fmt: skip
-        sheet(experiment, episodes).save(options.out / f"experiment-{number + 1}.webp", quality=80)
+        sheet(rows(experiment, episodes)).save(options.out / f"experiment-{number + 1}.webp", quality=QUALITY)
         done.append((experiment, episodes))
     print(f"\n{table(done)}")
     summaries = [each.summary() for _, episodes in done for each in episodes]
@@ -129,31 +124,14 @@ def failures(summaries: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines) if failed else f"All of {len(summaries)} episodes were restored."
 
 
-def sheet(experiment: Experiment, episodes: Sequence[Episode]) -> Image.Image:
+def rows(experiment: Experiment, episodes: Sequence[Episode]) -> list[list[tuple[str, Rgb]]]:
     """A row for each goal: the goal as it was shown, then start and end of every episode."""
-    columns = 1 + 2 * experiment.starts
-    rows = [episodes[i : i + experiment.starts] for i in range(0, len(episodes), experiment.starts)]
-    cells = [[views(chosen[0])["goal"], *(views(one)[when] for one in chosen for when in ("start", "end"))]
-             for chosen in rows]  # fmt: skip
-    height, width = cells[0][0].shape[:2]
-    size = _WIDTH, _WIDTH * height // width
-    found = Image.new("RGB", (columns * size[0], len(rows) * size[1]))
-    draw = ImageDraw.Draw(found)
-    for i, (goal, line) in enumerate(zip(experiment.goals, cells, strict=True)):
-        titles = [f"goal: {goal}", *(f"{when} {n + 1}" for n in range(experiment.starts) for when in ("start", "end"))]
-        for j, (title, rgb) in enumerate(zip(titles, line, strict=True)):
-            corner = j * size[0], i * size[1]
-            found.paste(Image.fromarray(rgb).resize(size, Image.Resampling.LANCZOS), corner)
-            draw.text((corner[0] + 6, corner[1] + 4), title, fill="white", stroke_width=2, stroke_fill="black")
+    found: list[list[tuple[str, Rgb]]] = []
+    for i, goal in enumerate(experiment.goals):
+        seen = [views(one.recording) for one in episodes[i * experiment.starts : (i + 1) * experiment.starts]]
+        ends = [(f"{when} {n + 1}", each[when]) for n, each in enumerate(seen) for when in ("start", "end")]
+        found.append([(f"goal: {goal}", seen[0]["goal"]), *ends])
     return found
-
-
-def views(episode: Episode) -> dict[str, Rgb]:
-    """What the camera saw of the goal, of the start and at the end."""
-    corrected = (each for each in Recording(episode.recording).envelopes() if each.id.startswith("corrector.frame#"))
-    frames = [open_envelope(Frame, envelope) for envelope in corrected]
-    later = [frame for frame in frames if not frame.name.startswith("goal")]
-    return {"goal": frames[0].rgb, "start": later[0].rgb, "end": later[-1].rgb}
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ def episode(*, claimed: bool, true: bool) -> Episode:
         violated=() if claimed else (BROKEN,), looks=3,
     )  # fmt: skip
     losses = () if true else (Loss("mug", "left the table", said=False),)
-    judgement = Judgement(claimed, (HELD,), () if true else (BROKEN,), (), losses)
+    judgement = Judgement(claimed, (HELD,), () if true else (BROKEN,), (), losses, (HELD,))
     done = (outcome(1, transfer("mug", "tray", "table")),)
     code = 0 if claimed and true else 1
     return Episode(7, code, 31.234, verdict, judgement, done, True, "why | not", Path("tray.mcap"))
@@ -29,8 +29,8 @@ def test_a_summary_says_what_was_claimed_and_what_is_true() -> None:
     found = episode(claimed=True, true=False).summary()
     expected = {
         "seed": 7, "restored_by_truth": False, "restored_as_claimed": True, "false_success": True, "objects_lost": 1,
-        "objects_lost_unsaid": 1, "transfers": 1, "robot_seconds": 12.25, "wall_seconds": 31.23,
-        "failing_stage": "perception", "reason": "why | not",
+        "objects_lost_unsaid": 1, "transfers": 1, "relations_regained": 1, "robot_seconds": 12.25,
+        "wall_seconds": 31.23, "failing_stage": "perception", "reason": "why | not",
     }  # fmt: skip
     assert expected.items() <= found.items()
 
@@ -53,7 +53,8 @@ def test_rows_fit_their_header_and_all_is_counted() -> None:
     assert row(episode(claimed=True, true=True)).count("|") == HEADER.splitlines()[0].count("|")
     assert totals([bad, episode(claimed=True, true=False), episode(claimed=True, true=True)]) == (
         "1 of 3 restored, 0 refused before anything moved; "
-        "in truth 1, false successes 1, objects lost 2, 2 of them unsaid"
+        "in truth 1, false successes 1, objects lost 2, 2 of them unsaid; "
+        "12.2 robot seconds and 31.2 wall seconds per relation regained"
     )
 
 

@@ -57,11 +57,12 @@ def test_a_scene_restored_as_claimed() -> None:
     assert found.restored and found.claimed and not found.false_success
     assert found.differences == () and found.losses == ()
     assert "in(cup, tray)" in map(str, found.held) and "in(soup_can_near_sugar_box, soup_can)" in map(str, found.held)
+    assert list(map(str, found.regained)) == ["in(cup, tray)"]
 
 
 def test_a_success_that_the_truth_denies_is_a_false_one() -> None:
     found = judged(START, verdict(SHOWN, SHOWN))
-    assert found.false_success
+    assert found.false_success and found.regained == ()
     assert "in(cup, tray) holds by perception and does not hold in truth" in found.differences
 
 
