@@ -55,7 +55,7 @@ from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
 from stages.scene.relations import Tolerances, gaps
-from stages.scene.stance import TIPPED, Stances, standing_of, turned
+from stages.scene.stance import TIPPED, Stances, is_tipped, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
 _EXCHANGES = 200
@@ -588,7 +588,10 @@ class Demonstrator(Stage):
         if not complaint and not _reached(transfer, scene):
             complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
         now = next((item for item in scene.objects if item.name == transfer.object), None)
-        if not complaint and transfer.faces and not (now and shows(now, transfer.T_base_targets[0])):
+        wanted = transfer.T_base_targets[0]
+        if not complaint and now and is_tipped(self._catalogue[now.label], now.T_base_object, wanted):
+            complaint = f"release: {transfer.object} does not stand as it should"
+        if not complaint and transfer.faces and not (now and shows(now, wanted)):
             complaint = f"release: {transfer.object} {_WRONG_SIDE}"
         if not complaint:
             done = "done" if seen else "unknown: felt to stand, hidden from here"

@@ -27,7 +27,7 @@ from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.facing import sides
 from stages.scene.stance import Stances, Standing
-from stages.scene.virtual import rerooted, satisfied
+from stages.scene.virtual import fallen, rerooted, satisfied
 
 SEARCHES = 16
 """Times that a plan is searched for, each knowing more of what is in the way."""
@@ -204,7 +204,8 @@ class Planner(Stage):
             task.goal,
             held=frozenset(child for region, child in inside if region in regions),
             graspable=frozenset(item.name for item in task.current.objects if not self._why_not(item.label)),
-            turned=frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"},
+            turned=fallen(task.goal, task.current, self._catalogue).intersection(wanted(task.goal))
+            | frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"},
         )
 
     def _why_not(self, label: str) -> str:
@@ -295,7 +296,7 @@ class Planner(Stage):
         placements = Placements(task.goal, self._stances, taught)
         # What may be anywhere is turned on the table.
         goal = dict.fromkeys(problem.faced, TABLE) | wanted(task.goal)
-        return Targets(placements, self._config.workspace, self._robot, handling, goal)
+        return Targets(placements, self._config.workspace, self._robot, handling, goal, turned=problem.turned)
 
     def _search(self, attempt: Attempt, text: str) -> Solution:
         if self._config.engine == search.BFS:

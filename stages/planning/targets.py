@@ -157,10 +157,18 @@ class Targets:
     """
 
     def __init__(
-        self, placements: Placements, workspace: Workspace, robot: Robot, handling: Handling, goal: dict[str, str]
+        self,
+        placements: Placements,
+        workspace: Workspace,
+        robot: Robot,
+        handling: Handling,
+        goal: dict[str, str],
+        *,
+        turned: Collection[str] = (),
     ) -> None:
-        """``goal`` maps the objects of the goal to what carries them."""
+        """``goal`` maps the objects of the goal to what carries them; those ``turned`` must be put on another side."""
         self._placements, self._workspace, self._handling, self._goal = placements, workspace, handling, goal
+        self._turned = turned
         self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
         self._tries = TRIES
@@ -189,7 +197,7 @@ class Targets:
         chosen = options.places[number]
         if not late and self._crowds(chosen, rest, scene):
             return Crowded(step)
-        targets = self._targets(options.places[number : number + self._workspace.targets], scene)
+        targets = self._targets(_alike_from(number, options.places[: number + self._workspace.targets]), scene)
         return Next(targets, scene.after(step.item, chosen, step.destination))
 
     def _targets(self, places: Sequence[Standing], scene: Scene) -> Floats:
@@ -212,7 +220,7 @@ class Targets:
                 return Crowded(step)
             onward = self._chosen(rest, scene.after(step.item, places[number], step.destination), again, late)
             if isinstance(onward, list):
-                offered = places[number : max(self._workspace.targets, number + FEWEST)]
+                offered = _alike_from(number, places[: max(self._workspace.targets, number + FEWEST)])
                 return [self._harmless(offered, step, rest, scene, [one[0] for one in onward]), *onward]
             failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
@@ -259,8 +267,10 @@ class Targets:
         return self._known[key]
 
     def _tried(self, step: Step, options: Options, rest: Sequence[Step], scene: Scene) -> Iterator[int]:
-        """Numbers of places that the hand reaches: those where what goes beside the object follows, first."""
+        """Numbers of places that the hand reaches: those where what goes beside the object follows, first; and those
+        from which an object that must be turned can be taken to where it belongs."""
         children = [other for other in rest if other.parent == step.item]
+        children += [other for other in rest if other.item == step.item and step.item in self._turned]
         late: list[int] = []
         for number in islice(options.handled.places(), FOLLOWED if children else None):
             after = scene.after(step.item, options.places[number], step.destination)
@@ -388,8 +398,25 @@ class Targets:
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
             crowded = max(0.0, self._workspace.spacing - min(room, free))
             spots.append(Placement(spot, 0.2 * distance + 2 * crowded + _hidden(spot, others, scene)))
-        spots.sort(key=lambda placement: placement.cost)
-        return spots[: 2 * self._workspace.targets], ()
+        spots = sorted(spots, key=lambda placement: placement.cost)[: 2 * self._workspace.targets]
+        if step.item in self._turned:
+            spots += self._on_other_sides(item, spots, others, scene)
+        return spots, ()
+
+    def _on_other_sides(
+        self, item: Standing, spots: Sequence[Placement], others: Sequence[Standing], scene: Scene
+    ) -> Iterator[Placement]:
+        """The object on each side on which it rests, at the first of the spots that has room for it: the hand that
+        cannot turn it at once takes it anew from there."""
+        for resting in self._placements.resting(item):
+            for spot in spots:
+                T = resting.T_table_stance.copy()
+                T[:2, 3] = spot.standing.T_table_stance[:2, 3]
+                place = scene.rested(replace(resting, T_table_stance=T), TABLE)
+                room = min((_clearance(place, other) for other in others), default=np.inf)
+                if room >= self._workspace.clearance and self._on_table(place, scene):
+                    yield Placement(place, spot.cost)
+                    break
 
     def _grid(self, item: Standing, scene: Scene) -> list[Standing]:
         """The object as it is, on the table, at every 3 cm of the robot's area."""
@@ -418,6 +445,11 @@ def _trouble(step: Step, options: Options, failed: Blocked | Crowded | None) -> 
     if not failed.obstacles and blocked.obstacles:
         return blocked
     return replace(failed, crowding=failed.crowding | blocked.crowding)
+
+
+def _alike_from(number: int, places: Sequence[Standing]) -> list[Standing]:
+    """One of the places, and those after it where the object stands on the same side."""
+    return [place for place in places[number:] if place.stance is places[number].stance]
 
 
 def _fits(item: Standing, carrier: Standing) -> bool:

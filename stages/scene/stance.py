@@ -289,5 +289,14 @@ def standing_of(objects: Iterable[SceneObject], stances: Mapping[str, Stances], 
 
 def turned(item: CatalogueObject, A: Floats, B: Floats) -> float:
     """Radians between the sides of an object that are up in two poses (4 x 4), modulo its symmetries."""
-    ups = B[2, :3] @ item.symmetries.transforms()[:, :3, :3]
+    return _between_ups(A, B, item.symmetries.transforms())
+
+
+def is_tipped(item: CatalogueObject, A: Floats, B: Floats) -> bool:
+    """Whether another side is up in two poses (4 x 4), of those that differ by more than what is printed on them."""
+    return _between_ups(A, B, item.symmetries.lookalikes()) > TIPPED
+
+
+def _between_ups(A: Floats, B: Floats, symmetries: Floats) -> float:
+    ups = B[2, :3] @ symmetries[:, :3, :3]
     return float(np.arccos(np.clip((ups @ A[2, :3]).max(), -1.0, 1.0)))

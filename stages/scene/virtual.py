@@ -14,7 +14,7 @@ from stages.messages.scene import Assertion, SceneGraph, VirtualObject
 from stages.scene import facing
 from stages.scene.catalogue import Catalogue, Symmetries
 from stages.scene.relations import Support
-from stages.scene.stance import Standing
+from stages.scene.stance import Standing, is_tipped
 
 CLAIMED = 0.85
 """Share of a region's radius within which what is perceived to be in it is said to be: the rest is for perception's
@@ -111,10 +111,7 @@ def region_poses(virtual: VirtualObject, T_base_parent: Floats, symmetries: Symm
     One pose per symmetry of the parent, a ring of them where it is round. Near symmetries count: depth alone cannot
     tell such poses apart, so the side on which the estimate puts the region means nothing.
     """
-    near = np.concatenate([np.eye(4)[None], symmetries.near.reshape(-1, 4, 4)])
-    exact = symmetries.transforms(SYMMETRY_STEP)
-    turned = near[:, None] @ exact[None]
-    return T_base_parent @ turned.reshape(-1, 4, 4) @ virtual.T_parent_virtual
+    return T_base_parent @ symmetries.lookalikes(SYMMETRY_STEP) @ virtual.T_parent_virtual
 
 
 def in_region(
@@ -176,17 +173,30 @@ def satisfied(
 
     Compares the topological layout (paper, section VI-B): exist, on, in and clear as the current scene asserts them;
     has and in of a virtual object by the current poses, in ``share`` of its radius, whatever virtual objects the
-    current scene has, and faces by the current poses. Poses and objects that the goal does not name are not compared,
-    except that these may not be on or in a goal object that was clear.
+    current scene has, and faces by the current poses. What lies and stood, or the other way round, is not on or in what
+    carries it as the goal has it. Poses and objects that the goal does not name are not compared, except that these
+    may not be on or in a goal object that was clear.
     """
+    over = fallen(goal, current, catalogue)
     # Regions of the current scene may have the same names and mean other places.
     regions_now = {item.name for item in current.virtual_objects}
     real = (item for item in current.assertions if regions_now.isdisjoint(item.arguments))
-    asserted = {(item.predicate, item.arguments) for item in real}
+    standing = (item for item in real if item.predicate not in ("on", "in") or item.arguments[0] not in over)
+    asserted = {(item.predicate, item.arguments) for item in standing}
     asserted |= _held_regions(goal, current, catalogue, share) | facing.held(goal, current)
     held = [item for item in goal.assertions if (item.predicate, item.arguments) in asserted]
     violated = [item for item in goal.assertions if (item.predicate, item.arguments) not in asserted]
     return tuple(held), tuple(violated)
+
+
+def fallen(goal: SceneGraph, current: SceneGraph, catalogue: Catalogue) -> frozenset[str]:
+    """Objects of the goal of which another side is up than there: they have fallen over, or must be laid down."""
+    shown = {item.name: item.T_base_object for item in goal.objects}
+    return frozenset(
+        item.name
+        for item in current.objects
+        if item.name in shown and is_tipped(catalogue[item.label], item.T_base_object, shown[item.name])
+    )
 
 
 def _held_regions(

@@ -65,6 +65,7 @@ REASONS = {
     "not_there": rf"exist\({_ITEM}\) does not hold",
     "not_seen_on": rf"{_ITEM} is not seen on or in {_OTHER}",
     "wrong_side": rf"{_ITEM} is not seen to show the side that it should",
+    "tipped": rf"{_ITEM} does not stand as it should",
     "not_felt": rf"(?:\bunknown: )?nothing was felt below {_ITEM} where it was let go of",
     "not_perceived": rf"{_ITEM} is not in the perceived scene",
     "no_room_aside": rf"no room to put {_ITEM} aside",

@@ -491,12 +491,28 @@ def test_a_bottle_beside_a_box_near_the_edge_is_not_placed_over_it():
     assert reached(goal, executed(start, found))
 
 
-def test_beside_what_lies_now_and_stood_when_it_was_shown_is_where_it_was_shown_to_be():
+def test_what_lies_and_stood_is_set_upright_before_something_goes_beside_it():
     goal = Layout().put("milk_carton", 0.12, -0.04, yaw=-2.0).put("sauce_bottle", 0.01, -0.12, yaw=0.3)
     start = Layout().put("milk_carton", 0.0, 0.0, yaw=1.0, resting=1).put("sauce_bottle", 0.0, -0.3, resting=1)
     found = plan(goal, start)
-    assert [transfer.object for transfer in found.transfers] == ["sauce_bottle"]
+    assert [transfer.object for transfer in found.transfers] == ["milk_carton", "sauce_bottle"]
+    ups = [transfer.T_base_targets[:, 2, 2] for transfer in found.transfers]
+    assert np.concatenate(ups) == pytest.approx(1.0)
     assert reached(goal, executed(start, found))
+
+
+def test_what_no_hand_turns_at_once_is_laid_down_on_another_side_first():
+    goal, start = Layout().put("tea_box", 0.0, 0.15), Layout().put("tea_box", 0.0, -0.1, yaw=0.7, resting=1)
+    found = plan(goal, start)
+    assert [transfer.object for transfer in found.transfers] == ["tea_box", "tea_box"]
+    assert reached(goal, executed(start, found)) and reached(goal, executed(start, found, which=99))
+    assert not reached(goal, executed(start, msgspec.structs.replace(found, transfers=found.transfers[:1])))
+
+
+def test_what_lies_so_that_no_hand_takes_it_is_refused_by_name():
+    found = plan(Layout().put("cereal_box", 0.0, 0.15), Layout().put("cereal_box", 0.0, -0.1, resting=1))
+    assert found.status == "refused"
+    assert found.reason.startswith("cereal_box cannot be taken from table to table: no straight approach to a grasp")
 
 
 def test_what_makes_room_is_not_put_where_the_room_is_needed():

@@ -14,7 +14,6 @@ from stages.geometry.regions import Region
 from stages.messages.scene import SceneGraph
 from stages.planning.symbolic.problem import TABLE, carriers
 from stages.planning.symbolic.search import Step
-from stages.scene.catalogue import CatalogueObject
 from stages.scene.facing import sides, turned_to
 from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed
 from stages.scene.virtual import in_region, region_poses
@@ -24,8 +23,6 @@ RING = 24
 """Most places around a symmetric parent."""
 TURNED = 0.03
 """Cost of a quarter turn that the demonstration did not show, in metres of shift."""
-LAID = 0.05
-"""Cost of leaving the object lying (or standing) as it is where the demonstration shows it otherwise."""
 _HANGS = 0.012
 """Metres above what carries it from which on something must be under an object."""
 _ANYWHERE = 1.0
@@ -148,6 +145,14 @@ class Placements:
         child = scene.standing[step.parent].T_table_object
         return in_region(taught, item.T_table_object, child, item.stance.item.symmetries)
 
+    def resting(self, item: Standing) -> Iterator[Standing]:
+        """An object where it is, on every side on which it rests, turned by quarters."""
+        for R in item.stance.item.resting:
+            for k in range(QUARTERS):
+                T = yawed(2 * np.pi * k / QUARTERS, item.T_table_stance[:3, 3])
+                T[:3, :3] = T[:3, :3] @ R
+                yield Standing.at(item.name, self._stances[item.stance.item.name], T)
+
     def reserved(self, pending: Sequence[Step], scene: Scene) -> list[list[Standing]]:
         """Where the object of each step still to come may stand on the table, as demonstrated first."""
         steps = [step for step in pending if step.destination == TABLE and step.item in self._poses]
@@ -227,16 +232,12 @@ def _any_side(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
     """Ways to turn an object at a demonstrated pose, with their cost.
 
     First those that look the same and keep the side up that is up now, so that nobody has to turn it over; where
-    there is none it has to be laid down or put upright, or may stay as it is.
+    there is none it has to be laid down or put upright.
     """
     up = item.T_table_object[2, :3]
-    alike = [T @ S for S in _lookalikes(item.stance.item)]
+    alike = T @ item.stance.item.symmetries.lookalikes(2 * np.pi / QUARTERS)
     kept = [turned for turned in alike if turned[2, :3] @ up > np.cos(ALIGNED)]
     found = [(turned, 0.002 * k) for k, turned in enumerate(kept or [T])]
-    if not kept:
-        as_it_is = T.copy()
-        as_it_is[:3, :3] = item.T_table_object[:3, :3]
-        found.append((as_it_is, LAID))
     quarters = (yawed(2 * np.pi * k / QUARTERS, np.zeros(3))[:3, :3] for k in range(1, QUARTERS))
     return found + [(_turned(found[0][0], R), TURNED + 0.002 * k) for k, R in enumerate(quarters)]
 
@@ -245,10 +246,3 @@ def _turned(T: Floats, R: Floats) -> Floats:
     result = T.copy()
     result[:3, :3] = R @ T[:3, :3]
     return result
-
-
-def _lookalikes(item: CatalogueObject) -> Floats:
-    """Symmetries, then near symmetries, of an object; continuous ones in quarter turns."""
-    exact = item.symmetries.transforms(2 * np.pi / QUARTERS)
-    near = item.symmetries.near.reshape(-1, 4, 4)
-    return np.concatenate([exact, (near[:, None] @ exact[None]).reshape(-1, 4, 4)])

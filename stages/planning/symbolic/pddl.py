@@ -170,5 +170,5 @@ def _goal(problem: Problem) -> list[str]:
         *(fact("in" if s in problem.concave else "on", item, s) for item, s in problem.goal.items()),
         *(fact("clear", item) for item in sorted(problem.clear)),
         *(fact("in", region.name, region.child) for region in problem.regions.values()),
-        *(f"(not {fact('turned', item)})" for item in sorted(problem.faced)),
+        *(f"(not {fact('turned', item)})" for item in sorted(problem.faced | problem.turned)),
     ]

@@ -43,7 +43,7 @@ class Problem:
     faced: frozenset[str] = frozenset()
     """Items of which the goal says which side they show."""
     turned: frozenset[str] = frozenset()
-    """Those of them that show another one now, or may do so."""
+    """Those of them that show another one now, or may do so, and all of which another one is up."""
     obstructions: frozenset[tuple[str, str, str]] = frozenset()
     """(obstacle, item, support or region): the obstacle must have been picked before the item is placed there."""
 

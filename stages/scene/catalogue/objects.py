@@ -80,6 +80,11 @@ class Symmetries:
         turns = np.concatenate([np.eye(4)[None], *(_turns(axis, offset, step) for axis, offset in self.continuous)])
         return np.einsum("sij,tjk->stik", discrete, turns).reshape(-1, 4, 4)
 
+    def lookalikes(self, step: float = np.deg2rad(5)) -> Floats:
+        """The same, then those combined with near symmetries: all turns that depth hardly tells apart, N x 4 x 4."""
+        near = np.concatenate([np.eye(4)[None], self.near.reshape(-1, 4, 4)])
+        return (near[:, None] @ self.transforms(step)[None]).reshape(-1, 4, 4)
+
 
 ASYMMETRIC = Symmetries(np.empty((0, 4, 4)), (), np.empty((0, 4, 4)))
 """Of what looks like itself in one pose alone."""

@@ -106,6 +106,15 @@ def test_what_lies_though_it_stood_was_knocked_over_and_a_failed_transfer_may_sa
     assert [loss.said for loss in judged(final, verdict(SHOWN, SHOWN), outcomes=(slipped,)).losses] == [True]
 
 
+def test_what_lies_as_it_did_at_the_start_is_not_restored() -> None:
+    start = with_pose(SHOWN, "sugar_box", Layout().put("sugar_box", 0.0, -0.2, resting=1).poses["sugar_box"])
+    found = TRUTH.judge(
+        [snapshot(SHOWN, "goal"), snapshot(start, "start")], Goal(name="tea", scene=SHOWN.graph(), pddl=""),
+        verdict(SHOWN, SHOWN), (),
+    )  # fmt: skip
+    assert "on(sugar_box, table)" in map(str, found.violated) and found.false_success and found.losses == ()
+
+
 def test_what_lies_as_it_was_shown_was_not_knocked_over() -> None:
     lying = Layout().put("sugar_box", 0.0, -0.2, resting=1).poses["sugar_box"]
     shown = with_pose(SHOWN, "sugar_box", lying)

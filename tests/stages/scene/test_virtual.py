@@ -142,6 +142,14 @@ def test_a_stranger_on_a_goal_object_violates_clear():
     assert violated(breakfast().graph(), breakfast().put("salt_shaker", 0.2, 0.3).graph()) == set()
 
 
+def test_what_lies_and_stood_is_not_on_what_carries_it_but_upside_down_a_can_is_as_good():
+    goal = Layout().put("tray", 0.0, 0.0).put("water_bottle", 0.0, 0.0, on="tray").put("soup_can", 0.3, 0.0)
+    lying = Layout().put("tray", 0.0, 0.0).put("water_bottle", 0.0, 0.0, on="tray", resting=1)
+    lost = violated(goal.graph(), lying.put("soup_can", 0.3, 0.0, resting=1).graph())
+    assert lost == {"in(water_bottle, tray)"}
+    assert violated(lying.graph(), goal.graph()) == {"in(water_bottle, tray)"}
+
+
 def test_every_assertion_of_the_goal_is_either_satisfied_or_violated():
     goal, start = beside().graph(), beside().put("mug", -0.3, 0).graph()
     held, lost = satisfied(goal, start, catalogue())
