@@ -122,7 +122,11 @@ class Planner(Stage):
         missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
         if missing:
             return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
-        return self._plan(task, task.goal, ctx)
+        plan = self._plan(task, task.goal, ctx)
+        if plan.status != "solved":
+            return plan
+        held, _ = satisfied(task.goal, task.current, self._catalogue)
+        return replace_fields(plan, at_least=search.fewest(self._problem(task, held)))
 
     def _plan(self, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """A plan for the task's goal, which may tell the regions that were ``taught`` the other way round."""

@@ -504,7 +504,8 @@ def plan_text(plan: Plan) -> str:
     if plan.status != "solved":
         return f"### {plan.status}\n{plan.reason}"
     steps = [f"{number}. `{item.pick}` `{item.place}`" for number, item in enumerate(plan.transfers, 1)]
-    return "\n".join(["### Plan", *steps, "", f"{plan.expanded} states expanded"])
+    bound = f"every plan needs {plan.at_least} transfers at least; {plan.expanded} states expanded"
+    return "\n".join(["### Plan", *steps, "", bound])
 
 
 def progress_line(message: Message) -> str:

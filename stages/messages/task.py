@@ -82,6 +82,8 @@ class Plan(Message, frozen=True, kw_only=True):
     problem_pddl: str
     expanded: int = 0
     """Search states expanded."""
+    at_least: int = 0
+    """Transfers that every plan needs, whatever room there is and the hand reaches; 0 where there is no plan."""
 
 
 class TransferRequest(Message, frozen=True, kw_only=True):

@@ -116,6 +116,7 @@ def _plan(plans: Sequence[Plan]) -> list[str]:
     if first.status != "solved":
         return [f"{first.status}: {_clip(first.reason, WIDTH - 12)}"]
     steps = [f"{number}  {transfer.pick} {transfer.place}" for number, transfer in enumerate(first.transfers, 1)]
+    steps.append(f"{len(first.transfers)} transfers; every plan needs {first.at_least} at least")
     again = f"planned again after {len(plans) - 1} looks" if len(plans) > 1 else ""
     return [*steps, *([again] if again else [])]
 

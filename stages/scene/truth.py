@@ -103,14 +103,14 @@ class Truth:
 
     def _satisfied(self, wanted: SceneGraph, snapshot: Snapshot) -> tuple[tuple[Assertion, ...], tuple[Assertion, ...]]:
         """Which of the goal's relations hold at a look and which do not."""
-        scenes = (self._scene(named, wanted) for named in self._exchanged(snapshot))
+        scenes = (self._scene(named, wanted) for named in self._exchanged(snapshot, wanted))
         found = [satisfied(wanted, scene, self._catalogue, share=1.0) for scene in scenes]
         return min(found, key=lambda relations: len(relations[1]))
 
-    def _exchanged(self, snapshot: Snapshot) -> Iterator[Snapshot]:
-        """The scene with every way to name its equal objects, as it is first."""
+    def _exchanged(self, snapshot: Snapshot, wanted: SceneGraph) -> Iterator[Snapshot]:
+        """The scene with every way to give its objects the goal's names for their kind."""
         labels = [label_of(name, self._catalogue) for name in snapshot.names]
-        for names in exchanges(labels, snapshot.names, {}):
+        for names in exchanges(labels, snapshot.names, {item.name: item.label for item in wanted.objects}):
             yield msgspec.structs.replace(snapshot, names=tuple(names))
 
     def _scene(self, snapshot: Snapshot, taught: SceneGraph) -> SceneGraph:

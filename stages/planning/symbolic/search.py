@@ -75,6 +75,11 @@ def breadth_first(problem: Problem, *, reluctant: Collection[str] = ()) -> Solut
     return Solution(None, expanded)
 
 
+def fewest(problem: Problem) -> int:
+    """Transfers that every plan needs: as many as the shortest has while geometry forbids none; 0 where none has."""
+    return len(breadth_first(problem).steps or ())
+
+
 def _path(parents: dict[State, tuple[State, Step] | None], state: State) -> tuple[Step, ...]:
     steps: list[Step] = []
     while (came := parents[state]) is not None:

@@ -136,6 +136,12 @@ def test_equal_objects_are_exchangeable_and_taught_under_any_names() -> None:
     assert found.restored and found.differences == ()
 
 
+def test_the_only_one_of_its_kind_may_have_been_taught_as_the_second() -> None:
+    taught = Layout({{"cup": "cup_2"}.get(name, name): T for name, T in SHOWN.poses.items()})
+    found = judged(SHOWN, verdict(taught, taught), taught=taught)
+    assert found.restored and found.differences == ()
+
+
 def test_what_is_in_no_goal_must_stay() -> None:
     stranger = START.poses | {"mug": Layout().put("mug", -0.1, 0.3).poses["mug"]}
     pushed = SHOWN.poses | {"mug": Layout().put("mug", -0.1, 0.36).poses["mug"]}
