@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -50,16 +52,31 @@ class Attempt:
 
     problem: Problem
     reluctant: frozenset[str]
+    regrasped: frozenset[str] = frozenset()
+    """What is laid on another side first, for the hand cannot turn it at once."""
+
+    def steps(self, found: Sequence[Step]) -> tuple[Step, ...]:
+        """What the search found, with a step more for what is regrasped, unless it is put aside anyway."""
+        moved = Counter(step.item for step in found)
+        once = {item for item in self.regrasped if moved[item] == 1}
+        parts = (
+            (Step(step.item, step.source, TABLE), replace(step, source=TABLE)) if step.item in once else (step,)
+            for step in found
+        )
+        return tuple(chain.from_iterable(parts))
 
     def after(self, blocked: Blocked, steps: Sequence[Step]) -> Attempt | None:
         """The attempt that makes room for a step, or None where nothing is left to try.
 
+        What the hand cannot put down on another side is laid down in between.
         What stands in the way is moved first, or placed later if the plan itself put it there. A region without
         room may have it elsewhere, and what carries the object may stand where the hand does not get above it: then
         what the object goes beside is moved first, or what that is beside, and so on; or else what carries it. What
         the object goes beside and is in the hand's way would be so wherever it stood.
         """
         step, problem = blocked.step, self.problem
+        if blocked.why and step.item in problem.turned - self.regrasped:
+            return replace(self, regrasped=self.regrasped | {step.item})
         earlier = {before.item for before in steps[: steps.index(step)]}
         obstacles = problem.graspable & set(blocked.obstacles) - {step.parent}
         beside = [name for name in problem.beside(step.item) if name not in blocked.obstacles] if step.region else []
@@ -143,6 +160,7 @@ class Planner(Stage):
                 return _solved(left, text, problem)
         try:
             self._check(problem, task)
+            self._check_grasps(problem, self._scene(task), ctx)
             return self._solve_with_room(problem, task, taught, ctx)
         except Impossible as reason:
             refused, blocked = _answer("refused", text, reason=str(reason)), reason.blocked
@@ -244,6 +262,16 @@ class Planner(Stage):
             if support in problem.clear or problem.goal.get(support, TABLE) != problem.supports.get(support, TABLE):
                 raise Impossible(f"{item} on {support} would have to move, but it {why}")
 
+    def _check_grasps(self, problem: Problem, scene: Scene, ctx: Context) -> None:
+        """Raises :class:`Impossible` where no hand takes what must be turned, were there nothing else."""
+        handling = self._handling(self._robot, self._robot.table, ctx.rng)
+        for item in sorted(problem.turned):
+            step, standing = Step(item, TABLE, TABLE), scene.standing[item]
+            alone = replace(scene, standing={item: standing}, supports={item: TABLE})
+            handled = handling.of(step, alone, [standing])
+            if next(handled.places(), None) is None:
+                raise Impossible(_no_room(Blocked(step, (), handled.why_not()[0])))
+
     def _solve_with_room(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
         scene = self._scene(task)
@@ -268,17 +296,18 @@ class Planner(Stage):
             solution = self._search(attempt, text)
             if solution.steps is None:
                 raise Impossible(_no_room(blocked) if blocked else _dead_end(attempt.problem, problem), blocked)
-            again = _failed_before(solution.steps, task.avoid)
-            poses = targets.of(solution.steps, current, again=again, late=attempt.reluctant)
+            found = attempt.steps(solution.steps)
+            again = _failed_before(found, task.avoid)
+            poses = targets.of(found, current, again=again, late=attempt.reluctant)
             if isinstance(poses, Crowded):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
                 continue
             if not isinstance(poses, Blocked):
-                steps = zip(solution.steps, poses, strict=True)
-                if attempt.problem != problem:  # What was thought to be in the way need not be.
+                steps = zip(found, poses, strict=True)
+                if attempt.problem != problem or attempt.regrasped:  # What was thought to be in the way need not be.
                     steps = shortened(steps, problem, targets, current, avoided=task.avoid)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
-            blocked, following = poses, attempt.after(poses, solution.steps)
+            blocked, following = poses, attempt.after(poses, found)
             if following is None:
                 break
             ctx.log(f"{_no_room(blocked)}; looks for another way")

@@ -281,7 +281,8 @@ class Targets:
         yield from late
 
     def _follows(self, child: Step, parent: str, scene: Scene) -> bool:
-        """Whether a step can be done once its parent is where it is, at least after others have moved."""
+        """Whether a step can be done once its parent is where it is, at least after others have moved; the next step of
+        the same object at once."""
         options = self._options(child, (), scene, again=False)
         if isinstance(options, Options):
             if next(options.handled.places(), None) is not None:
@@ -289,7 +290,8 @@ class Targets:
             obstacles = options.handled.why_not()[1]
         else:
             obstacles = options.obstacles
-        return bool(obstacles) and parent not in obstacles and _effort(obstacles, scene)[0] == 0
+        own = child.item == parent or parent in obstacles
+        return bool(obstacles) and not own and _effort(obstacles, scene)[0] == 0
 
     def _crowds(self, item: Standing, rest: Sequence[Step], scene: Scene) -> bool:
         pending = {after.item for after in rest} - {item.name}
