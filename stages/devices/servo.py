@@ -109,7 +109,7 @@ class Servo:
             felt += (data.actuator_force[actuators] - taken[k] - felt) * (self._timestep / FILTER)
             at_hand = np.abs(felt) / levers(self._model, data, self._hand, dofs)
             self.force = max(self.force, float(at_hand[arm].max()))
-            if self._is_wrong(command.guard):
+            if self._is_wrong(command.guard, (k + 1) * self._timestep):
                 return
             if (k + 1) % round(PIECE / self._timestep) == 0:
                 yield
@@ -144,12 +144,13 @@ class Servo:
         yield
         self._is_wrong(guard)
 
-    def _is_wrong(self, guard: Guard | None) -> bool:
-        """Whether the robot must stop, and why."""
+    def _is_wrong(self, guard: Guard | None, seconds: float = 0.0) -> bool:
+        """Whether the robot must stop, and why; ``seconds`` after the motion began."""
         if self._asked:
             self.stopped, self.reason = "stop", "as asked"
-        elif guard is not None and (broken := guard.broken(opening=self.opening(), force=self.force, error=self.error)):
-            self.stopped, self.reason = broken
+        elif guard is not None:
+            broken = guard.broken(opening=self.opening(), force=self.force, error=self.error, seconds=seconds)
+            self.stopped, self.reason = broken or ("", "")
         return bool(self.stopped)
 
     def _stand(self) -> None:

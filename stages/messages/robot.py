@@ -8,8 +8,12 @@ from runner.contract import Message, Struct
 from stages.messages.arrays import Matrix, Vector
 
 Stopped = Literal["", "stop", "slip", "touch", "fault"]
-"""Why a command was not carried out to its end: somebody asked, the fingers moved, something was in the way, or the
+"""Why a command was not carried out to its end: somebody asked, what is held slips, something was in the way, or the
 robot itself did not do it."""
+
+
+LIFTED = 0.15
+"""Seconds after which a motion that lifts bears what is lifted."""
 
 
 class Guard(Struct, frozen=True, kw_only=True):
@@ -26,11 +30,16 @@ class Guard(Struct, frozen=True, kw_only=True):
     """Newtons from outside, as if they acted on the hand: motor efforts beyond those that the motion takes."""
     error: float = 0.05
     """Radians (metres) by which a joint may be where it was not commanded to be."""
+    load: float = 0.0
+    """Newtons that must have been felt from outside by the time that what is lifted is borne."""
 
-    def broken(self, *, opening: float, force: float, error: float) -> tuple[Stopped, str] | None:
-        """Which of it does not hold for what is measured, and what that is; None where all does."""
+    def broken(self, *, opening: float, force: float, error: float, seconds: float = 0.0) -> tuple[Stopped, str] | None:
+        """Which of it does not hold for what is measured, ``seconds`` after the motion began, and what that is; None
+        where all does."""
         if not self.narrowest <= opening <= self.widest:
             return "slip", f"the fingers are {1e3 * opening:.0f} mm apart"
+        if seconds > LIFTED and force < self.load:
+            return "slip", f"nothing weighs on the hand ({force:.1f} N)"
         if force > self.force:
             return "touch", f"{force:.0f} N at the hand"
         if error > self.error:

@@ -32,6 +32,7 @@ REASONS = {
     "hand_holding": rf"; in the hand: {_NAMES}",
     "barred": r"stopped, the way back is barred: ",
     "slipped": rf"(?:\bslip: )?the fingers are [\d.]+ mm apart{_WAY}",
+    "left_behind": rf"(?:\bslip: )?nothing weighs on the hand \([\d.]+ N\){_WAY}",
     "pushed": rf"(?:\btouch: )?(?:[\d.]+ N at the hand|a joint is [\d.]+ degrees off){_WAY}",
     "knocked_over": rf"; knocked over: {_NAMES}",
     "else_holds": r"; every other relation of the goal holds",

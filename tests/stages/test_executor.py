@@ -101,6 +101,27 @@ class Bench:
             self.meddle(command.label)
         raise AssertionError("no answer")
 
+    def since(self, holds: Callable[[], bool]) -> list[float]:
+        """Gets the time of the first step of the physics after which something holds."""
+        servo, times = self.simulation.servo, list[float]()
+        step = servo._step  # pyright: ignore[reportPrivateUsage]
+
+        def stepped() -> None:
+            step()
+            if not times and holds():
+                times.append(self.simulation.time)
+
+        servo._step = stepped  # pyright: ignore[reportPrivateUsage]
+        return times
+
+    def stands_after(self, times: list[float]) -> float:
+        """Seconds from then until the arm that was stopped stood."""
+        return next(state.time for state in self.states if state.stopped and state.time > times[0]) - times[0]
+
+    def touched(self, name: str) -> bool:
+        """Whether anything but the table touches an object."""
+        return bool(self.simulation._touched(name) - {"table"})  # pyright: ignore[reportPrivateUsage]
+
     def is_home(self) -> bool:
         state = self.does(READ)
         where = dict(zip(state.joint_names, state.positions, strict=True))
@@ -341,14 +362,42 @@ def test_an_object_that_falls_from_the_hand_is_noticed_at_once() -> None:
     bench.meddle = let_fall
     outcome = bench.transfer(before, "soup_can", "table", standing("soup_can", 0.55, 0.45))
     assert (outcome.success, outcome.failed_stage, outcome.held) == (False, "slip", "")
-    stopped = next(state for state in bench.states if state.stopped)
-    assert stopped.time - fell[0] < 0.2 + 0.1  # The fingers take a moment to close.
+    assert bench.stands_after(fell) < 0.2
     assert bench.is_home()
+
+
+@pytest.mark.parametrize("name", ["soup_can", "sugar_box", "tea_box"])
+def test_an_object_that_stays_behind_when_it_is_lifted_is_noticed_at_once(name: str) -> None:
+    """The fingers slide along it: nothing but its weight is missing."""
+    bench, low = Bench(0, "tea"), np.inf
+    before, target = bench.poses(), bench.poses()[name]
+    target[0, 3] += 0.02
+    does = bench.does
+
+    def lifts_smoothly(command: RobotCommand) -> RobotState:
+        nonlocal low
+        lifts = command.label == f"lift {name}"
+        low = bench.simulation.hand()[2] if lifts else np.inf
+        bench.simulation.slide(0.0 if lifts else 1.0)
+        return does(command)
+
+    def stays_behind() -> bool:
+        risen = bench.simulation.layout()[name][2, 3] - before[name][2, 3]
+        return bench.simulation.hand()[2] > low + 0.002 and abs(risen) < 0.0005
+
+    bench.does = lifts_smoothly
+    stays = bench.since(stays_behind)
+    outcome = bench.transfer(before, name, "table", target)
+    assert (outcome.success, outcome.failed_stage, outcome.held) == (False, "slip", "")
+    assert outcome.reason.startswith("nothing weighs on the hand")
+    assert bench.stands_after(stays) < 0.2
+    assert bench.is_home()
+    assert np.linalg.norm(bench.poses()[name][:3, 3] - before[name][:3, 3]) < 0.005
 
 
 @pytest.mark.parametrize(("destination", "barred"), [("table", False), ("tray", False), ("table", True)])
 def test_what_slides_down_in_the_hand_is_put_down_all_the_same(destination: str, barred: bool) -> None:
-    """Where it was to go; where something bars that, where it was taken from."""
+    """Where it was to go; where something bars that, where it was taken from. It slides once it is lifted."""
     bench, began = Bench(0, "tea"), list[float]()
     before, target = bench.poses(), standing("soup_can", 0.55, 0.45)
     if destination == "tray":
@@ -357,7 +406,7 @@ def test_what_slides_down_in_the_hand_is_put_down_all_the_same(destination: str,
     def let_slide(label: str) -> None:
         if label == "lift soup_can":
             began.append(bench.simulation.time)
-            bench.simulation.slide(0.01 if bench.simulation.time < began[0] + 0.4 else 1.0)
+            bench.simulation.slide(0.01 if 0.2 < bench.simulation.time - began[0] < 0.6 else 1.0)
         if label == "carry soup_can" and barred:
             bench.simulation.place("sugar_box", standing("sugar_box", *target[:2, 3]), settle=0.0)
 
@@ -386,8 +435,10 @@ def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> N
     before = bench.poses()
     seen = {name: T for name, T in before.items() if name != "tea_box"}
     x, y = before["tea_box"][:2, 3]
+    touched = bench.since(lambda: bench.touched("tea_box"))
     outcome = bench.transfer(seen, "cup", "table", standing("cup", x, y))
     assert (outcome.success, outcome.failed_stage) == (False, "touch")
+    assert bench.stands_after(touched) < 0.2
     assert "N at the hand" in outcome.reason
     assert bench.is_home()
     after = bench.poses()
@@ -424,7 +475,9 @@ def test_what_somebody_puts_in_the_way_home_is_felt_and_another_way_is_found() -
             bench.simulation.place("milk_carton", standing("milk_carton", *(hand[2] + 0.1 * ahead)), settle=0.0)
 
     bench.meddle = bar
+    touched = bench.since(lambda: bench.touched("milk_carton"))
     outcome = bench.transfer(bench.poses(), "cup", "table", standing("cup", 0.62, -0.30))
+    assert bench.stands_after(touched) < 0.2
     assert (outcome.failed_stage, outcome.held) == ("unknown", "")
     assert "on the way to go home" in outcome.reason
     assert bench.is_home()

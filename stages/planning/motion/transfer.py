@@ -46,6 +46,8 @@ _EARLY = 0.025
 """Metres above the target from which on a touch, while an object is lowered, is its support, whatever is beside it."""
 _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
+_BORNE = 0.3
+"""Share of an object's weight that the hand feels, at least, once it is lifted: it may weigh half of what is known."""
 _PRESS = 12.0
 """Newtons from which on a finger does not slip past the object but stands on it."""
 _ASIDE = 0.012
@@ -254,10 +256,16 @@ class TransferRoutine:
         self.in_hand = world.carried
         self._log(f"{world.carried}: grasped with {grasp.name!r}, {1e3 * state.gripper_width:.0f} mm wide")
         narrowest, widest = self._held_between(grasp)
-        lifting = Guard(narrowest=narrowest, widest=widest)
-        yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
-        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(lifting, force=_BUMP + self._weight))
-        guard = replace(lifting, force=_TOUCH + self._weight)
+        holding = Guard(narrowest=narrowest, widest=widest)
+        lifting = replace(holding, load=_BORNE * self._weight)
+        try:
+            yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
+        except _BrokenOff as broken:
+            if broken.state.stopped == "slip" and self._is_held(broken.state, grasp):
+                self.in_hand = ""  # The fingers slide along what they leave behind.
+            raise
+        yield from self._do(f"carry {world.carried}", plan.carry, guard=replace(holding, force=_BUMP + self._weight))
+        guard = replace(holding, force=_TOUCH + self._weight)
         early = SLID if self._stands_alone(at) else _EARLY
         return (yield from self._put_down(at, plan.place, guard=guard, early=early))
 

@@ -58,6 +58,7 @@ SAID = {
     "no sequence of transfers moves cup while nothing cannot be moved": (
         "die Tasse lässt sich in keiner Reihenfolge dorthin bringen"
     ),
+    "slip: nothing weighs on the hand (0.1 N) on the way to lift cup": "das Ding blieb stehen, als die Hand es hob",
     "release: cup is not seen on or in tray": "beim Loslassen: die Tasse ist nicht auf oder in dem Tablett zu sehen",
     "mug would have to be turned, but it has no grasp in the catalogue": (
         "der Becher müsste gedreht werden, aber das Ding lässt sich nicht greifen"
