@@ -529,7 +529,7 @@ def progress_line(message: Message) -> str:
         case TransferRequest(number=number, transfer=transfer):
             line = f"transfer {number}: {transfer.object} to {transfer.destination}"
         case Outcome(number=number, success=success, failed_stage=stage, reason=reason):
-            line = f"transfer {number} " + ("done" if success else f"failed at {stage}: {reason}")
+            line = f"transfer {number} " + ("felt to stand" if success else f"failed at {stage}: {reason}")
         case CameraCalibration(success=success, reason=reason):
             line = f"**{'calibrated' if success else 'not calibrated'}**: {reason}"
         case Verdict(success=success, reason=reason):

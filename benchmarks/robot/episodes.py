@@ -123,7 +123,7 @@ def messages(recording: Recording, kind: type[M]) -> Iterator[M]:
 
 
 HEADER = (
-    "| seed | exit | relations hold | in truth | lost | transfers done | looks | wall time | recording | reason |\n"
+    "| seed | exit | relations hold | in truth | lost | felt to stand | looks | wall time | recording | reason |\n"
     "|---|---|---|---|---|---|---|---|---|---|"
 )
 
@@ -132,11 +132,11 @@ def row(episode: Episode) -> str:
     """One line of the table."""
     verdict, judgement, outcomes = episode.verdict, episode.judgement, episode.outcomes
     held = _share(verdict.satisfied, verdict.violated) if verdict else "-"
-    done = f"{sum(outcome.success for outcome in outcomes)} of {len(outcomes)}"
+    felt = f"{sum(outcome.success for outcome in outcomes)} of {len(outcomes)}"
     word = "COMPLETE" if episode.complete else "INCOMPLETE"
     why = "" if episode.code == 0 else episode.reason
     cells = [
-        episode.seed, episode.code, held, _share(judgement.held, judgement.violated), len(judgement.losses), done,
+        episode.seed, episode.code, held, _share(judgement.held, judgement.violated), len(judgement.losses), felt,
         verdict.looks if verdict else 0, f"{episode.seconds:.0f} s", word, why,
     ]  # fmt: skip
     return f"| {' | '.join(map(str, cells))} |"

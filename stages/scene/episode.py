@@ -14,6 +14,8 @@ from stages.scene.text import tree
 from stages.scene.truth import Judgement
 
 WIDTH = 98
+FELT = "felt to stand"
+"""What became of a transfer as far as the hand knows; done is only what is then seen there."""
 Section = tuple[str, list[str]]
 
 
@@ -129,7 +131,7 @@ def _actions(outcomes: Sequence[Outcome]) -> list[str]:
             str(item.number),
             item.object,
             item.destination,
-            "done" if item.success else f"FAILED at {item.failed_stage}",
+            FELT if item.success else f"FAILED at {item.failed_stage}",
             item.grasp,
             str(item.attempts),
             f"{item.robot_seconds:.1f} s",
@@ -196,7 +198,7 @@ def _effort(episode: Episode) -> list[str]:
     rows = [
         ["looks", str(len(episode.looks))],
         ["plans", f"{len(episode.plans)}, {sum(plan.expanded for plan in episode.plans)} search states"],
-        ["transfers", f"{tried}, {sum(item.success for item in episode.outcomes)} done"],
+        ["transfers", f"{tried}, {sum(item.success for item in episode.outcomes)} {FELT}"],
         ["robot time", f"{sum(item.robot_seconds for item in episode.outcomes):.1f} s"],
         ["motion planning", f"{sum(item.planning_seconds for item in episode.outcomes):.1f} s"],
         ["restarts", "; ".join(episode.restarts) or "none"],

@@ -314,7 +314,7 @@ def test_ghosts_and_boxes_stand_where_they_belong() -> None:
 def test_progress_tells_the_story(drawn: dict[str, list[Drawing]]) -> None:
     (page,) = [item for item in drawn["Verdict"] if isinstance(item, Text)]
     assert page.markdown.startswith("- the person lays out the **goal** scene")
-    assert "- transfer 1 done" in page.markdown and page.markdown.endswith("**restored**: ")
+    assert "- transfer 1 felt to stand" in page.markdown and page.markdown.endswith("**restored**: ")
     failed = outcome(3, transfer("cup", "table", "tray"), failed_stage="ik", reason="out of reach")
     assert progress_line(failed) == "transfer 3 failed at ik: out of reach"
     assert progress_line(Restore(name="tea")) == "asked to restore **tea**"
