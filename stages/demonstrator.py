@@ -368,7 +368,7 @@ class Demonstrator(Stage):
             ctx.log(plan.reason, level="warning")
             return self._look_for(self._state.missing, self._state.scene, ctx)
         if plan.status == "satisfied":
-            return self._look_again("planner", "the planner finds nothing to do, yet relations are violated", ctx)
+            return self._look_again("planner", f"the planner finds nothing to do; {self._violated()}", ctx)
         if self._state.complaint:
             return self._look_again("executor", f"{self._state.complaint}; no other way: {plan.reason}", ctx)
         return self._look_again("planner", plan.reason, ctx)
@@ -533,6 +533,14 @@ class Demonstrator(Stage):
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
+        unsure = [
+            f"{item.name} ({100 * (item.probability or 0):.0f} %)" for item in scene.objects if is_below(item, SURE)
+        ]
+        if unsure:
+            looks = self._state.repeats + 1
+            ctx.log(
+                f"still in doubt after {looks} looks, remembered all the same: {', '.join(unsure)}", level="warning"
+            )
         ctx.log(f'goal "{name}" remembered: {len(scene.objects)} objects, {len(scene.assertions)} assertions')
         yield Goal(name=name, scene=scene, pddl=goal_pddl(name, scene))
         self._state = replace(self._state, goals=goals, goal=scene, phase=Phase.IDLE, repeats=0)
@@ -623,7 +631,7 @@ class Demonstrator(Stage):
         ctx.log(f"plan {state.plans} ({change}): {steps}")
         replans = state.replans + (change == "replaced")
         if replans > self._config.max_replans:
-            return self._fail("planner", f"the plan was replaced {replans} times", ctx)
+            return self._fail("planner", f"the plan was replaced {replans} times; {self._violated()}", ctx)
         first, *rest = plan.transfers
         number = state.transfers + 1
         self._state = replace(
@@ -663,6 +671,12 @@ class Demonstrator(Stage):
             plans=state.plans,
             transfers=state.transfers,
         )
+
+    def _violated(self) -> str:
+        """The first relation of the goal that does not hold, in words."""
+        state = self._state
+        assert state.goal is not None and state.scene is not None  # A plan answers a task, and a task holds both.
+        return f"{satisfied(state.goal, state.scene, self._catalogue)[1][0]} does not hold"
 
     def _fallen(self) -> list[str]:
         """What lies and stands neither as at the start nor as in the goal; upside down nothing falls."""

@@ -159,7 +159,7 @@ class Planner(Stage):
                 left = shortened(zip(steps, poses, strict=True), problem, targets, scene, avoided=task.avoid)
                 return _solved(left, text, problem)
         try:
-            self._check(problem, task)
+            self._check(problem, task, violated[0])
             self._check_grasps(problem, self._scene(task), ctx)
             return self._solve_with_room(problem, task, taught, ctx)
         except Impossible as reason:
@@ -240,10 +240,11 @@ class Planner(Stage):
             return ""
         return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * self._widest:.1f} cm"
 
-    def _check(self, problem: Problem, task: Task) -> None:
+    def _check(self, problem: Problem, task: Task, violated: Assertion) -> None:
         """Raises :class:`Impossible` for goals that no search needs to look at."""
         if problem.satisfied():
-            raise Impossible("no transfer changes what is violated: every object is where the goal has it")
+            what = "no transfer changes what is violated: every object is where the goal has it"
+            raise Impossible(f"{what}; {violated} does not hold")
         if circle := cycle(problem.goal):
             raise Impossible(f"in the goal {_listed(circle, sort=False)} rest on each other in a circle")
         if circle := cycle({item: region.parent for item, region in problem.regions.items()}):
@@ -312,7 +313,7 @@ class Planner(Stage):
                 break
             ctx.log(f"{_no_room(blocked)}; looks for another way")
             attempt = following
-        raise Impossible(_no_room(blocked) if blocked else "no order of transfers leaves room for the hand", blocked)
+        raise Impossible(_no_room(blocked) if blocked else _no_order(attempt.reluctant), blocked)
 
     def _scene(self, task: Task) -> Scene:
         """What stands there now, known or not."""
@@ -400,6 +401,10 @@ def _dead_end(attempted: Problem, original: Problem) -> str:
     moving = {item for item, support in original.goal.items() if original.supports[item] != support}
     fixed = {item for item in original.items if item not in original.graspable}
     return f"no sequence of transfers moves {_listed(moving)} while {_listed(fixed) or 'nothing'} cannot be moved"
+
+
+def _no_order(crowding: Iterable[str]) -> str:
+    return f"no order of transfers leaves room for the hand: {_listed(crowding)} in the way"
 
 
 def _no_room(blocked: Blocked) -> str:

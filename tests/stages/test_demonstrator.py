@@ -223,6 +223,14 @@ def test_a_scene_nobody_asked_for_is_ignored() -> None:
     assert episode.seen(GOAL) == []
 
 
+def test_where_the_planner_finds_nothing_to_do_the_relation_that_does_not_hold_is_named() -> None:
+    episode = Episode(repeats=0)
+    episode.until_task()
+    verdict = the_verdict(episode.planned(status="satisfied"))
+    expected = f"the planner finds nothing to do; {verdict.violated[0]} does not hold"
+    assert verdict.failed_stage == "planner" and verdict.reason.startswith(expected)
+
+
 def test_a_refused_plan_is_the_planners_verdict() -> None:
     episode = Episode(repeats=0)
     episode.until_task()
@@ -463,7 +471,8 @@ def test_plans_that_keep_changing_end() -> None:
         episode.ended(number, step, failed_stage="grasp", reason="slipped")
         episode.seen(START)
     verdict = the_verdict(episode.planned(transfer("cup_4", "table", "tray")))
-    assert verdict.failed_stage == "planner" and "replaced 3 times" in verdict.reason
+    assert verdict.failed_stage == "planner" and "replaced 3 times; " in verdict.reason
+    assert verdict.reason.endswith(f"{verdict.violated[0]} does not hold")
 
 
 def test_after_the_verdict_nothing_happens() -> None:
@@ -672,8 +681,11 @@ def test_a_goal_that_is_in_doubt_is_looked_at_again_before_it_is_remembered() ->
     episode.called(Teach(name="tea"))
     episode.seen(judged(GOAL, 0.2))
     episode.seen(judged(GOAL, 0.2))
+    assert not any("remembered all the same" in line for line in episode.ctx.lines)
     (goal,) = episode.seen(judged(GOAL, 0.2))
     assert isinstance(goal, Goal)  # with what there is, after as many looks as are taken
+    said = ", ".join(f"{one.name} (20 %)" for one in GOAL.objects)
+    assert f"still in doubt after 3 looks, remembered all the same: {said}" in episode.ctx.lines
 
 
 @pytest.mark.parametrize("probability", [0.6, 0.95])

@@ -18,9 +18,9 @@ from stages.planner import Planner
 from stages.planning.handling import Handling
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
-from stages.planning.symbolic.problem import TABLE
+from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Step
-from stages.planning.targets import Next, Targets, Workspace
+from stages.planning.targets import Crowded, Next, Targets, Workspace
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
@@ -373,6 +373,19 @@ def test_what_is_wider_than_the_gripper_is_refused():
         found.reason
         == "soup_can would have to move from table to tea_box, but it is 6.8 cm wide and the gripper takes 6.0 cm"
     )
+
+
+def test_where_nothing_is_to_be_moved_the_relation_that_does_not_hold_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Problem, "satisfied", lambda _: True)
+    violated = satisfied(breakfast().graph(), START.graph(), catalogue())[1]
+    assert plan(breakfast(), START).reason == (
+        f"no transfer changes what is violated: every object is where the goal has it; {violated[0]} does not hold"
+    )
+
+
+def test_where_one_always_crowds_the_other_it_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Targets, "of", lambda *_, **__: Crowded(Step("cup", TABLE, "tray")))
+    assert plan(breakfast(), START).reason == "no order of transfers leaves room for the hand: cup in the way"
 
 
 def test_objects_that_rest_on_each_other_in_the_goal_are_refused():

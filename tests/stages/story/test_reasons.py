@@ -59,6 +59,20 @@ SAID = {
         "die Tasse lässt sich in keiner Reihenfolge dorthin bringen"
     ),
     "slip: nothing weighs on the hand (0.1 N) on the way to lift cup": "das Ding blieb stehen, als die Hand es hob",
+    "no transfer changes what is violated: every object is where the goal has it; in(cup, tray) does not hold": (
+        "etwas stimmt nicht, und etwas zu bewegen hilft nicht; die Tasse ist nicht, wo es hingehört, "
+        "auf oder in dem Tablett"
+    ),
+    "the planner finds nothing to do; in(cup, tray) does not hold (3 looks at scene 'start')": (
+        "etwas stimmt nicht, und ich weiß nicht, was zu bewegen ist; die Tasse ist nicht, wo es hingehört, "
+        "auf oder in dem Tablett, nach 3-mal Hinsehen"
+    ),
+    "the plan was replaced 9 times; in(cup, tray) does not hold": (
+        "der Plan musste 9-mal geändert werden; die Tasse ist nicht, wo es hingehört, auf oder in dem Tablett"
+    ),
+    "no order of transfers leaves room for the hand: cup, mug in the way": (
+        "in keiner Reihenfolge ist Platz für die Hand; im Weg: die Tasse und der Becher"
+    ),
     "release: cup is not seen on or in tray": "beim Loslassen: die Tasse ist nicht auf oder in dem Tablett zu sehen",
     "mug would have to be turned, but it has no grasp in the catalogue": (
         "der Becher müsste gedreht werden, aber das Ding lässt sich nicht greifen"
