@@ -154,7 +154,9 @@ class Planner(Stage):
             return _answer("satisfied", text)
         if (steps := search.continued(task.then, problem)) and task.goal is taught:
             targets, scene = self._targets(problem, task, taught, ctx), self._scene(task)
-            poses = targets.of(steps, scene, again=_failed_before(steps, task.avoid), late=problem.items)
+            poses = targets.of(
+                steps, scene, again=_failed_before(steps, task.avoid), late=problem.items, what="the rest"
+            )
             if isinstance(poses, list):
                 left = shortened(zip(steps, poses, strict=True), problem, targets, scene, avoided=task.avoid)
                 return _solved(left, text, problem)
@@ -292,14 +294,14 @@ class Planner(Stage):
         current, targets = self._scene(task), self._targets(problem, task, taught, ctx)
         blocked: Blocked | None = None
         attempt = Attempt(problem, frozenset(_moved(key)[0] for key in task.avoid))
-        for _ in range(SEARCHES):
+        for number in range(1, SEARCHES + 1):
             text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
             solution = self._search(attempt, text)
             if solution.steps is None:
                 raise Impossible(_no_room(blocked) if blocked else _dead_end(attempt.problem, problem), blocked)
             found = attempt.steps(solution.steps)
             again = _failed_before(found, task.avoid)
-            poses = targets.of(found, current, again=again, late=attempt.reluctant)
+            poses = targets.of(found, current, again=again, late=attempt.reluctant, what=f"search {number}")
             if isinstance(poses, Crowded):
                 attempt = replace(attempt, reluctant=attempt.reluctant | {poses.step.item})
                 continue
@@ -330,7 +332,9 @@ class Planner(Stage):
         placements = Placements(task.goal, self._stances, taught)
         # What may be anywhere is turned on the table.
         goal = dict.fromkeys(problem.faced, TABLE) | wanted(task.goal)
-        return Targets(placements, self._config.workspace, self._robot, handling, goal, turned=problem.turned)
+        return Targets(
+            placements, self._config.workspace, self._robot, handling, goal, turned=problem.turned, log=ctx.log
+        )
 
     def _search(self, attempt: Attempt, text: str) -> Solution:
         if self._config.engine == search.BFS:

@@ -56,7 +56,9 @@ def shortened(
 
     def placed(fewer: Sequence[Step]) -> list[tuple[Step, Floats]] | None:
         again = [step for step in fewer if step.key in avoided]
-        poses = targets.of(fewer, scene, again=again, late=problem.items) if leads_home(fewer, problem) else None
+        if not leads_home(fewer, problem):
+            return None
+        poses = targets.of(fewer, scene, again=again, late=problem.items, what="a shorter plan")
         return list(zip(fewer, poses, strict=True)) if isinstance(poses, list) else None
 
     best, k = list(steps), 0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, takewhile
+from itertools import count, islice, takewhile
 from math import hypot
 from typing import TYPE_CHECKING
 
@@ -44,6 +44,8 @@ FEWEST = 4
 BRANCHES, TRIES = 4, 80
 """Places of one step from which is gone on, and how many in all before each step has but one."""
 
+TOLD = 10
+"""Steps that are looked at before it is said again how far the plan is."""
 FOLLOWED = 6
 """Places of what something goes beside for which is asked whether that can follow."""
 
@@ -165,22 +167,36 @@ class Targets:
         goal: dict[str, str],
         *,
         turned: Collection[str] = (),
+        log: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """``goal`` maps the objects of the goal to what carries them; those ``turned`` must be put on another side."""
+        """``goal`` maps the objects of the goal to what carries them; those ``turned`` must be put on another side.
+
+        ``log`` is told now and then how far it is.
+        """
         self._placements, self._workspace, self._handling, self._goal = placements, workspace, handling, goal
         self._turned = turned
         self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
         self._tries = TRIES
+        self._log, self._looked = log, count(1)
+        self._what, self._steps = "", 0
+        """Which plan it is, and its length."""
 
     def of(
-        self, steps: Sequence[Step], scene: Scene, *, again: Collection[Step] = (), late: Collection[str] = ()
+        self,
+        steps: Sequence[Step],
+        scene: Scene,
+        *,
+        again: Collection[Step] = (),
+        late: Collection[str] = (),
+        what: str = "a plan",
     ) -> list[Floats] | Blocked | Crowded:
         """T_base_targets of every step, best first, N x 4 x 4 each; or the step that cannot come now.
 
         Steps ``again`` failed before with the best poses and get those that come next. Items that are ``late``
-        already may crowd others.
+        already may crowd others. ``what`` is said of how far it is.
         """
+        self._what, self._steps = what, len(steps)
         found = self._chosen(steps, scene, again, late)
         return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]
 
@@ -188,6 +204,7 @@ class Targets:
         self, step: Step, rest: Sequence[Step], scene: Scene, *, again: bool, late: bool
     ) -> Next | Blocked | Crowded:
         """One step's targets and the scene after it, whatever becomes of the ``rest``."""
+        self._tell(f"one transfer after the other: {len({one.item for one in (step, *rest)})} objects to move", step)
         options = self._options(step, rest, scene, again)
         if isinstance(options, Blocked):
             return options
@@ -200,6 +217,11 @@ class Targets:
         targets = self._targets(_alike_from(number, options.places[: number + self._workspace.targets]), scene)
         return Next(targets, scene.after(step.item, chosen, step.destination))
 
+    def _tell(self, how_far: str, step: Step) -> None:
+        """Now and then, by what was looked at and not by the clock: a plan that is made again says the same."""
+        if next(self._looked) % TOLD == 0:
+            self._log(f"{how_far}; looks for a place for {step.item}")
+
     def _targets(self, places: Sequence[Standing], scene: Scene) -> Floats:
         return np.stack([scene.T_base_table @ item.T_table_object for item in places])
 
@@ -210,6 +232,7 @@ class Targets:
         if not steps:
             return []
         step, *rest = steps
+        self._tell(f"{self._what}: {self._steps - len(steps)} of {self._steps} transfers placed", step)
         options = self._options(step, rest, scene, step in again)
         if isinstance(options, Blocked):
             return options

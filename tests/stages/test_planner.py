@@ -1,5 +1,6 @@
 """Plans between hand-made scenes: transfers whose targets bring the goal about, or a reason why there are none."""
 
+import re
 from functools import cache
 
 import msgspec
@@ -682,6 +683,9 @@ def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other()
     task = Task(goal_name="goal", goal=OTHER_WAY_ROUND.graph(), current=FULL_TRAY.graph())
     found = planner().on_task(task, context)
     assert any("plans one transfer after the other" in line for line in context.lines)
+    for how_far in (r"search \d+: \d+ of \d+ transfers placed", r"one transfer after the other: \d+ objects to move"):
+        assert any(re.fullmatch(rf"{how_far}; looks for a place for \w+", line) for line in context.lines)
+    assert 10 < sum("; looks for a place for " in line for line in context.lines) < 100
     assert found.status == "solved", found.reason
     assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
     assert penetrations(executed(FULL_TRAY, found)) == []
