@@ -525,8 +525,8 @@ def test_what_no_hand_turns_at_once_is_laid_down_on_another_side_first():
 
 def test_what_is_in_the_way_of_a_hand_that_turns_an_object_twice_makes_room():
     """As a scene had it: the cereal box on the tea box, and in the goal where the hand comes from with that."""
-    goal = Layout().put("tea_box", -0.02, 0.05).put("cereal_box", -0.04, -0.08)
-    start = Layout().put("tea_box", 0.09, -0.32, resting=1).put("cereal_box", 0.0, 0.0, on="tea_box")
+    goal = Layout().put("tea_box", -0.02, 0.05, yaw=-0.28).put("cereal_box", -0.04, -0.08, yaw=1.41)
+    start = Layout().put("tea_box", 0.09, -0.32, yaw=-1.76, resting=1).put("cereal_box", 0, 0, yaw=-1.97, on="tea_box")
     found = plan(goal, start)
     assert found.status == "solved", found.reason
     assert [transfer.object for transfer in found.transfers].count("tea_box") == 2
