@@ -121,9 +121,15 @@ def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[n
 
 def depth(region: Region, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """How deep N points lie inside the region, metres, N: distance to the nearest edge line, negative outside."""
+    inward, offset = sides(region)
+    return (points @ inward.T - offset).min(1)
+
+
+def sides(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit normals of the edges, inward, E x 2, and how far each edge lies along its normal, metres, E."""
     along = edges(region)
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
-    return (points @ inward.T - (region * inward).sum(1)).min(1)
+    return inward, (region * inward).sum(1)
 
 
 def inside(inner: Region, outer: Region, *, margin: float = 0.0) -> bool:

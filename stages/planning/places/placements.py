@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,6 +41,12 @@ class Scene:
     """Of the table, in its frame, as far as it was seen; None where that is not known."""
     eye: Floats | None = None
     """Where the camera is, in the table's frame; None where that is not known."""
+
+    @cached_property
+    def surface_edges(self) -> tuple[Floats, Floats]:
+        """Of a surface that is known: see :func:`stages.geometry.regions.sides`."""
+        assert self.surface is not None
+        return regions.sides(self.surface)
 
     @staticmethod
     def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
@@ -110,24 +117,32 @@ class Placements:
         self._stances = stances
         self._sides = sides(goal)
 
-    def of(self, step: Step, scene: Scene) -> list[Placement]:
-        """All placements of a step of the goal, in the table frame; their height is still to be found."""
+    def of(self, step: Step, scene: Scene) -> Iterator[Placement]:
+        """All placements of a step of the goal, in the table frame; their height is still to be found.
+
+        They are many, and mostly the first few are enough: each is made when it is asked for.
+        """
         item = scene.standing[step.item]
         stances = self._stances[self._labels[step.item]]
         nominal = self._nominal(step, scene)
         shown = self._as_shown(step, scene) if step.region else nominal[0][:2, 3]
         nominal.sort(key=lambda T: float(np.linalg.norm(T[:2, 3] - shown)))
-        shifts = list(self._shifts(step, scene))
-        made: list[Placement] = []
+        shifts = np.array(list(self._shifts(step, scene)))
+        lengths = np.hypot(*shifts.T)
+        bases: list[Standing] = []
+        costs: list[Floats] = []
         for k, T in enumerate(nominal):
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
             for turned, cost in self._orientations(T, item, scene):
-                base = Standing.at(step.item, stances, turned)
-                for shift in shifts if k == 0 and cost < TURNED else shifts[:13]:
-                    standing = _shifted(base, shift)
-                    if self._as_taught(step, standing, scene):
-                        made.append(Placement(standing, away + cost + float(np.hypot(*shift))))
-        return sorted(made, key=lambda placement: placement.cost)
+                bases.append(Standing.at(step.item, stances, turned))
+                costs.append(away + cost + lengths[: None if k == 0 and cost < TURNED else 13])
+        which = [(base, shift) for base, some in enumerate(costs) for shift in range(len(some))]
+        every = np.concatenate(costs)
+        for number in np.argsort(every, kind="stable").tolist():
+            base, shift = which[number]
+            standing = _shifted(bases[base], shifts[shift])
+            if self._as_taught(step, standing, scene):
+                yield Placement(standing, float(every[number]))
 
     def _orientations(self, T: Floats, item: Standing, scene: Scene) -> list[tuple[Floats, float]]:
         """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it."""
@@ -224,8 +239,10 @@ def spiral(pitch: float, reach: float) -> list[tuple[float, float]]:
     return sorted(points, key=lambda point: (round(float(np.hypot(*point)), 9), point))
 
 
-def _shifted(item: Standing, shift: tuple[float, float]) -> Standing:
-    return replace(item, T_table_stance=yawed(0.0, np.array([*shift, 0.0])) @ item.T_table_stance)
+def _shifted(item: Standing, shift: Floats) -> Standing:
+    T = item.T_table_stance.copy()
+    T[:2, 3] += shift
+    return Standing(item.name, item.stance, T)
 
 
 def _any_side(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
