@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from runner.graph.graph import Route
 from runner.message.codec import Deal, Envelope, pack
 from runner.message.packet import Process
+from runner.transport.vital import vital_thread
 
 PREFETCH = 2
 """Parts a replica holds at a time: the one it works on and the next, so that it never waits for a delivery."""
@@ -79,7 +80,11 @@ class Outgoing:
 
 
 class Delivery:
-    """All edges that leave one process. Its methods may be called from any thread; none is locked while it sends."""
+    """All edges that leave one process. Its methods may be called from any thread; nothing is locked while it sends.
+
+    Only :meth:`publish` waits. Parts are dealt, in one order for everybody, on a thread of their own: a replica that
+    stands still must not hold up whoever hears what the others have done with.
+    """
 
     def __init__(
         self,
@@ -100,39 +105,39 @@ class Delivery:
         self._publish = publish
         self._warn = warn
         self._changed = threading.Condition()
-        self._dealing = threading.Lock()
         self._stopping = stopping
         self._newest: dict[tuple[str, int], Process] = {}
         """The newest process seen of each replica."""
         for consumer, port, message_id in undone:
             for edge in self._edges_to(consumer, port):
                 edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
+        self._to_deal = threading.Event()
+        if any(edge.route.shared for edge in self._edges):
+            vital_thread("dealer", self._deal_all).start()
 
     def publish(self, port: str, envelope: Envelope, payload: bytes | bytearray) -> None:
-        """Sends a message once every consumer of a port has room, and deals it.
+        """Sends a message once every consumer of a port has room, and has it dealt.
 
         Raises Stopped where the graph ends meanwhile; it is sent then too.
         """
-        edges = [edge for edge in self._edges if edge.route.output == port]
         try:
             with self._changed:
-                for edge in edges:
-                    self._wait_for_room(edge, envelope.lineage)
-                    edge.note(envelope.id, envelope.lineage)
+                for edge in self._edges:
+                    if edge.route.output == port:
+                        self._wait_for_room(edge, envelope.lineage)
+                        edge.note(envelope.id, envelope.lineage)
         finally:
             self._publish(f"m/{self._stage}/{port}", payload)
-        self._deal(edges)
+        self._to_deal.set()
 
     def answered(self, consumer: str, done: Iterable[tuple[str, str]]) -> None:
         """Takes note that a consumer has done with (port, message id) pairs."""
-        edges = list(self._edges_to(consumer))
         with self._changed:
             for port, message_id in done:
-                for edge in edges:
-                    if edge.route.input == port:
-                        edge.answered(message_id)
+                for edge in self._edges_to(consumer, port):
+                    edge.answered(message_id)
             self._changed.notify_all()
-        self._deal(edges)
+        self._to_deal.set()
 
     def appeared(self, process: Process) -> None:
         """Takes note of a consumer's process that is there."""
@@ -143,7 +148,7 @@ class Delivery:
             self._newest[process.place] = process
             for edge in self._edges_to(process.stage):
                 edge.appeared(process.replica)
-        self._deal(self._edges_to(process.stage))
+        self._to_deal.set()
 
     def lost(self, process: Process) -> None:
         """Takes note of a consumer's process that is dead."""
@@ -151,17 +156,18 @@ class Delivery:
             if self._newest.get(process.place, process) <= process:
                 for edge in self._edges_to(process.stage):
                     edge.lost(process.replica)
-        self._deal(self._edges_to(process.stage))
+        self._to_deal.set()
 
     def _edges_to(self, consumer: str, port: str = "") -> Iterator[Outgoing]:
         for edge in self._edges:
             if edge.route.consumer == consumer and port in ("", edge.route.input):
                 yield edge
 
-    def _deal(self, edges: Iterable[Outgoing]) -> None:
-        """In one order for everybody, but with nothing locked that an acknowledgement needs."""
-        with self._dealing:
-            for edge in edges:
+    def _deal_all(self) -> None:
+        while True:
+            self._to_deal.wait()
+            self._to_deal.clear()
+            for edge in self._edges:
                 with self._changed:
                     dealt = list(edge.deal())
                 for key, deal in dealt:

@@ -10,10 +10,8 @@ import hashlib
 import os
 import queue
 import struct
-import sys
 import threading
 import time
-import traceback
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,6 +32,7 @@ from runner.transport.session import (
     open_session,
     private,
 )
+from runner.transport.vital import vital_thread
 
 ASK_AGAIN_SECONDS = 0.05
 """A peer that has just been met has not heard of every queryable."""
@@ -93,23 +92,29 @@ class Bus:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._closed = threading.Event()
         self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._caller = threading.Thread(target=self._call_all, name="bus", daemon=True)
+        self._caller = vital_thread("bus", self._call_all)
         self._caller.start()
 
     def publish(self, path: str, payload: bytes | bytearray, *, may_be_dropped: bool = False) -> None:
         """Sends without loss: a full link blocks. ``path`` is the key without the run. Once closed it sends nothing."""
         if self._closed.is_set():
             return
-        publisher = self._publishers.get(path)
-        if publisher is None:
-            control = zenoh.CongestionControl
-            publisher = self._publishers[path] = self._session.declare_publisher(
-                f"{self._run}/{path}",
-                congestion_control=control.DROP if may_be_dropped else control.BLOCK,
-                reliability=zenoh.Reliability.RELIABLE,
-            )
-        publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
+        try:
+            publisher = self._publishers.get(path) or self._declare_publisher(path, may_be_dropped)
+            publisher.put(payload, attachment=_SENT.pack(time.monotonic_ns(), _CLOCK))
+        except zenoh.ZError:
+            if not self._closed.is_set():  # meanwhile
+                raise
         os.sched_yield()  # Zenoh's thread that sends was often woken on this one's core
+
+    def _declare_publisher(self, path: str, may_be_dropped: bool) -> zenoh.Publisher:
+        control = zenoh.CongestionControl
+        publisher = self._publishers[path] = self._session.declare_publisher(
+            f"{self._run}/{path}",
+            congestion_control=control.DROP if may_be_dropped else control.BLOCK,
+            reliability=zenoh.Reliability.RELIABLE,
+        )
+        return publisher
 
     def log(self, text: str, level: Level) -> LogLine:
         """Sends a line of this process' log, which is shown and recorded, and returns it."""
@@ -229,14 +234,8 @@ class Bus:
             close_session(session)
 
     def _call_all(self) -> None:
-        """What a callback raises ends the process, with the traceback: it cannot go on half deaf."""
-        try:
-            while (call := self._calls.get()) is not None:
-                call()
-        except BaseException:
-            traceback.print_exc()
-            sys.stderr.flush()
-            os._exit(1)
+        while (call := self._calls.get()) is not None:
+            call()
 
 
 def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> None:

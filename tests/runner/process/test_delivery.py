@@ -1,6 +1,9 @@
 """A publisher waits when it must, deals parts to replicas and hands those of the dead to the living."""
 
+import subprocess
+import sys
 import threading
+import time
 from typing import Any
 
 import msgspec
@@ -10,6 +13,7 @@ from runner.graph.graph import Route
 from runner.message.codec import Deal, Envelope, unpack
 from runner.message.packet import Process
 from runner.process.delivery import PREFETCH, Delivery, Stopped
+from tests.runner.common.waiting import wait_until
 
 
 class Wire:
@@ -31,7 +35,10 @@ class Wire:
             case _:
                 raise AssertionError(key)
 
-    def take(self) -> list[tuple[int, str]]:
+    def take(self, count: int) -> list[tuple[int, str]]:
+        """Waits for what is dealt: that many, and no more."""
+        wait_until(lambda: len(self.dealt) >= count)
+        time.sleep(0.02)
         dealt, self.dealt = self.dealt, []
         return dealt
 
@@ -71,17 +78,17 @@ def test_parts_are_shared_and_each_replica_holds_few():
     for replica in (0, 1):
         delivery.appeared(Process("worker", replica))
     ids = [publish(delivery, wire, number, lineage=0) for number in range(6)]
-    assert [replica for replica, _ in wire.take()] == [0, 1] * PREFETCH
+    assert [replica for replica, _ in wire.take(4)] == [0, 1] * PREFETCH
     delivery.answered("worker", [("input", ids[1])])
-    assert wire.take() == [(1, ids[4])]
+    assert wire.take(1) == [(1, ids[4])]
 
 
 def test_parts_wait_until_there_is_a_replica():
     delivery, wire = make(shared=True)
     first = publish(delivery, wire, 0)
-    assert (wire.sent, wire.take()) == ([first], [])
+    assert (wire.sent, wire.take(0)) == ([first], [])
     delivery.appeared(Process("worker", 1))
-    assert wire.take() == [(1, first)]
+    assert wire.take(1) == [(1, first)]
 
 
 def test_parts_of_a_dead_replica_go_to_a_live_one():
@@ -89,24 +96,25 @@ def test_parts_of_a_dead_replica_go_to_a_live_one():
     for replica in (0, 1):
         delivery.appeared(Process("worker", replica))
     first, second = publish(delivery, wire, 0), publish(delivery, wire, 1)
-    assert wire.take() == [(0, first), (1, second)]
+    assert wire.take(2) == [(0, first), (1, second)]
     delivery.lost(Process("worker", 0))
-    assert wire.take() == [(1, first)]
+    assert wire.take(1) == [(1, first)]
 
 
 def test_a_death_that_is_heard_of_late_takes_nothing_from_the_successor():
     delivery, wire = make(shared=True)
     delivery.appeared(Process("worker", 0))
     first = publish(delivery, wire, 0)
+    assert wire.take(1) == [(0, first)]
     delivery.appeared(Process("worker", 0, 1))
     delivery.lost(Process("worker", 0, 0))
-    assert wire.take() == [(0, first), (0, first)]
+    assert wire.take(1) == [(0, first)]
 
 
 def test_a_successor_deals_what_its_predecessor_has_sent():
     delivery, wire = make((("worker", "input", "counter.number#7"),), shared=True)
     delivery.appeared(Process("worker", 0))
-    assert wire.take() == [(0, "counter.number#7")]
+    assert wire.take(1) == [(0, "counter.number#7")]
 
 
 def test_a_full_queue_blocks_until_an_acknowledgement():
@@ -145,16 +153,45 @@ def test_an_edge_of_policy_latest_never_blocks():
 
 
 def test_a_consumer_that_stands_still_holds_up_no_acknowledgement_of_others():
-    """Nothing is locked while something is sent."""
-    delivery, wire = make(shared=True, queue=50)
-    delivery.appeared(Process("worker", 0))
+    """All acknowledgements come on one thread."""
+    wire = Wire()
+    shared = Route("number", "worker", "input", "block", queue=50, shared=True, kept=0)
+    alone = Route("number", "printer", "input", "block", queue=50, shared=False, kept=0)
+    delivery = Delivery("counter", [shared, alone], wire.publish, lambda _: None, stopping=wire.stopping.is_set)
+    ids = [publish(delivery, wire, number) for number in range(2)]
+
+    def hear() -> None:
+        delivery.appeared(Process("worker", 0))
+        delivery.answered("printer", [("input", ids[0])])
+        delivery.lost(Process("worker", 1))
+        delivery.answered("printer", [("input", ids[1])])
+
     with wire.standing_still:
-        sender = threading.Thread(target=publish, args=(delivery, wire, 0))
-        sender.start()
-        while not wire.sent:
-            pass
-        assert delivery._changed.acquire(timeout=5)  # pyright: ignore - what an acknowledgement waits for
-        delivery._changed.release()  # pyright: ignore
-        assert unanswered(delivery) == [1]
-    sender.join(5)
-    assert wire.take() == [(0, "counter.number#0")]
+        caller = threading.Thread(target=hear)
+        caller.start()
+        caller.join(5)
+        assert not caller.is_alive()
+        assert unanswered(delivery) == [2, 0]
+        assert publish(delivery, wire, 2) == wire.sent[-1]
+    assert wire.take(2) == [(0, ids[0]), (0, ids[1])]
+
+
+FAILS = """
+import time
+from runner.graph.graph import Route
+from runner.message.packet import Process
+from runner.process.delivery import Delivery
+
+def publish(key, payload):
+    raise MemoryError("no room to deal")
+
+route = Route("number", "worker", "input", "block", queue=4, shared=True, kept=0)
+undone = [("worker", "input", "counter.number#0")]
+Delivery("counter", [route], publish, print, stopping=bool, undone=undone).appeared(Process("worker", 0))
+time.sleep(60)
+"""
+
+
+def test_a_process_that_can_deal_no_more_ends_and_says_why():
+    ended = subprocess.run([sys.executable, "-c", FAILS], check=False, capture_output=True, text=True, timeout=50)
+    assert (ended.returncode, ended.stderr.splitlines()[-1]) == (1, "MemoryError: no room to deal")
