@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import cast
@@ -63,8 +64,8 @@ class Recorder:
         self._to_say: deque[_Saying] = deque()
         """Since the last look, for what comes together is said together."""
         self._said: queue.SimpleQueue[list[_Saying] | None] = queue.SimpleQueue()
-        self._speaker = threading.Thread(target=self._say_all, name="speaker", daemon=True)
-        self._taker = threading.Thread(target=self._take_all, name="taker", daemon=True)
+        self._speaker = threading.Thread(target=self._or_end, args=(self._say_all,), name="speaker", daemon=True)
+        self._taker = threading.Thread(target=self._or_end, args=(self._take_all,), name="taker", daemon=True)
         self._ended = threading.Event()
         self._channels: dict[str, Callable[[], Iterator[Packet]]] = {}
         """By what is heard; each is taken before those that come before it on a link, and worked on after them."""
@@ -130,6 +131,15 @@ class Recorder:
         while self._presence.living and time.monotonic() < deadline:
             time.sleep(TICK_SECONDS / 5)
         self._writer.note_problem("the supervisor died")
+
+    def _or_end(self, work: Callable[[], None]) -> None:
+        """Does a thread's work; what it raises ends the recording, which says so: the graph would wait for ever."""
+        try:
+            work()
+        except BaseException as error:
+            traceback.print_exc()
+            self._writer.note_problem(f"the recorder failed: {type(error).__name__}: {error}".removesuffix(": "))
+            self.stop()
 
     # ------------------------------------------------------------------------------------------ what is heard
 

@@ -35,7 +35,7 @@ class Picture(Message, frozen=True, kw_only=True):
 class Session:
     """A recorder process and a bus that speaks to it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *program: str) -> None:
         self.path = folder / "pictures.mcap"
         self.log = folder / "log.txt"
         endpoint = new_endpoint()
@@ -44,7 +44,7 @@ class Session:
         self.bus.subscribe("j/*", self._on_journal)
         graph = '{"name": "pictures", "seed": 0, "view": null, "stages": {"camera": {"replicas": 1}}}'
         task = Manifest("test", endpoint, str(self.path), graph, (), {"camera/picture": topic(Picture)})
-        self.process = spawn("runner.process.recorder", task=msgspec.json.encode(task), log=self.log)
+        self.process = spawn(*program or ("runner.process.recorder",), task=msgspec.json.encode(task), log=self.log)
         self._presence = Presence()
         self._steps = 0
         self.bus.watch(self._presence.update)
@@ -172,3 +172,16 @@ def test_a_recording_that_cannot_be_created_is_refused(tmp_path: Path):
     assert session.process.wait(20) == EXIT_REFUSED
     assert "cannot be created: File exists" in last_lines(session.log, 1)[0]
     session.bus.close()
+
+
+@pytest.mark.parametrize("where", ["taker", "speaker"])
+def test_a_recorder_that_fails_ends_and_the_recording_says_why(tmp_path: Path, where: str, pictures: list[Picture]):
+    session = Session(tmp_path, "tests.runner.process.fails", where)
+    session.wait()
+    session.journal(session.send(0, pictures[0]))
+    assert session.process.wait(20) == EXIT_INCOMPLETE
+    session.bus.close()
+    reason = "the recorder failed: MemoryError: no room for a step"
+    assert last_lines(session.log, 1)[0].startswith(f"{session.path}: INCOMPLETE: {reason}; ")
+    assert "Traceback" in session.log.read_text()
+    assert reason in str(Recording(session.path).verdict)
