@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import queue
+import re
 import secrets
 import signal
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 
+from runner.contract import Refused
 from runner.graph.document import Document
 from runner.graph.placement import read_layout
 from runner.hosts.head import (
@@ -100,7 +102,7 @@ class Agent:
                 if isinstance(event, Dismiss):
                     return event
         hello = introduce(self._document, self._host, self._session)
-        run = self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS).decode()
+        run = _plain(self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS).decode())
         self._say(f"takes part in run {run}")
         self._folder = (self._recordings / run).absolute()
         (self._folder / "log").mkdir(parents=True, exist_ok=True)
@@ -129,6 +131,7 @@ class Agent:
 
     def _start(self, order: Start) -> None:
         process = order.process
+        _plain(process.stage)
         task = msgspec.structs.replace(
             order.task,
             directory=str(self._folder),
@@ -183,3 +186,10 @@ class Agent:
 
     def _say(self, text: str) -> None:
         self._terminal.show(self._host, text)
+
+
+def _plain(name: str) -> str:
+    """A name that the head has sent and that becomes part of a path here; raises Refused where it leads elsewhere."""
+    if not re.fullmatch(r"[\w-]+", name):
+        raise Refused(f"the head names {name!r}; valid: letters, digits, _ and -")
+    return name

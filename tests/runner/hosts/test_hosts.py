@@ -5,14 +5,22 @@ import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
 from runner.cli.main import main
-from runner.graph.placement import Host
+from runner.contract import EXIT_REFUSED
+from runner.graph.document import read_document
+from runner.graph.placement import Host, read_layout
+from runner.hosts.head import Dismiss, Hello, Start, control, network_of
 from runner.hosts.keys import make_keys
+from runner.message.packet import Process
+from runner.process.stage_process import Assignment
 from runner.recording.recording import Recording
 from runner.testing import read_until
+from runner.transport.bus import Bus
+from runner.transport.session import private
 from tests.runner.common.machines import (
     HOSTS,
     NAMES,
@@ -141,6 +149,36 @@ def test_a_host_with_another_graph_is_refused_with_the_difference(parties, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("run", "stage"), [("../elsewhere", "worker"), ("toys-1", "../../elsewhere/worker")])
+def test_a_host_writes_nowhere_but_in_its_folder(parties, tmp_path: Path, run: str, stage: str):
+    """Whatever its head calls a run or a stage."""
+    (tmp_path / "worker1" / "elsewhere").mkdir(parents=True)
+    party: Party = parties(on_loopback(), tmp_path)
+    document = read_document(HOSTS)
+    document.values["hosts"] |= party.machines.addresses
+    layout = read_layout(document)
+    name, own = document.values["name"], Process("head", 0, 1)
+    endpoint = private(layout.endpoint)
+    head = Bus(control(name), endpoint, network=network_of(layout, "head"), process=own, listen=True)
+
+    def join(text: bytes) -> bytes:
+        hello = msgspec.json.decode(text, type=Hello)
+        task = Assignment(run, "", "", stage, {}, 0, (), ())
+        for order in (Start(Process(stage, 0), task), Dismiss(0, "the end")):
+            head.publish(f"order/worker1/{hello.session}", msgspec.json.encode(order))
+        return run.encode()
+
+    head.serve("join", join)
+    head.announce()
+    party.start("worker1")
+    output = party.hosts["worker1"].communicate(timeout=60)[0]
+    head.close()
+    wrong = stage if "/" in stage else run
+    assert f"the head names {wrong!r}; valid: letters, digits, _ and -" in output
+    assert party.hosts["worker1"].returncode == EXIT_REFUSED
+    assert list(tmp_path.rglob("elsewhere/*")) == []
+
+
 def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
     party = parties(on_loopback(), tmp_path).start_all(*SLOW_PIECES)
     before = read_until(party.hosts["head"], "sum")
