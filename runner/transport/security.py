@@ -13,13 +13,15 @@ SPEAKING = ("put", "delete", "declare_queryable", "liveliness_token")
 EVERYTHING = (*SPEAKING, "declare_subscriber", "query", "reply", "declare_liveliness_subscriber", "liveliness_query")
 ORDERS = "hosts/*/order/**"
 """Keys on which the head has processes started."""
+QUESTIONS = "**/q/**"
+"""Keys on which the head answers, as itself and for the run."""
 
 
 def security(network: Network, credentials: Credentials) -> dict[str, Any]:
     """Settings of a Zenoh session, by key.
 
     Whoever shows no certificate of the graph's authority is not let in. Whoever is let in and is none of the graph's
-    hosts gets and sends nothing. Only the head has processes started.
+    hosts gets and sends nothing. Only the head has processes started and answers.
     """
     return {
         "transport/link/protocols": ["tls"],
@@ -55,17 +57,18 @@ def readers_only(network: Network | None, public: str | None) -> dict[str, Any]:
 
 
 def _hosts(network: Network) -> tuple[list[Any], list[Any], dict[str, list[str]]]:
-    """Rules, who there is, and which rules hold for whom: all hosts take part, and only the head gives orders."""
+    """Rules, who there is, and which rules hold for whom: all take part, and only the head orders and answers."""
     rules = [
         _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
         _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
+        _rule("answer", "deny", ("declare_queryable", "reply"), ("ingress",), QUESTIONS),
     ]
     subjects = [{"id": "hosts", "cert_common_names": list(network.hosts)}]
     policies = {"hosts": ["take part"]}
     # What a router sends on it has got from the head, or refused itself.
     if others := [name for name in network.hosts if name not in (network.head, ROUTER)]:
         subjects.append({"id": "others", "cert_common_names": others})
-        policies["others"] = ["give orders"]
+        policies["others"] = ["give orders", "answer"]
     return rules, subjects, policies
 
 

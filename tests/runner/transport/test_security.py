@@ -1,6 +1,7 @@
 """With keys, only the hosts of a graph take part: whoever else tries everything publishes, hears and calls nothing."""
 
 import json
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -154,26 +155,81 @@ def test_whoever_speaks_no_tls_is_not_let_in(table: Table, keys: Path):
         assert (PIECE, b"piece") not in table.arrived
 
 
-def test_only_the_head_gives_orders(keys: Path):
+@dataclass
+class Meeting:
+    """The place where the hosts of a graph meet: the head, one that listens and one that does as it likes."""
+
+    head: Bus
+    worker: Bus
+    other: Bus
+
+    @property
+    def stranger(self) -> zenoh.Session:
+        return self.other._session  # pyright: ignore
+
+
+@pytest.fixture
+def meeting(keys: Path, request: pytest.FixtureRequest) -> Iterator[Meeting]:
     endpoint = new_endpoint("tls/127.0.0.1:0")
     networks = [Network(name, "head", NAMES, "tls/127.0.0.1:0", False, credentials(keys, name)) for name in NAMES]
-    head = Bus("hosts/toys", endpoint, network=networks[0], listen=True)
-    worker, other = (Bus("hosts/toys", endpoint, network=network) for network in networks[1:])
+    run = getattr(request, "param", "hosts/toys")
+    head = Bus(run, endpoint, network=networks[0], listen=True)
+    made = Meeting(head, *(Bus(run, endpoint, network=network) for network in networks[1:]))
+    yield made
+    for bus in (made.other, made.worker, made.head):
+        bus.close()
+
+
+ORDER = "hosts/toys/order/worker1/1"
+
+
+@pytest.mark.parametrize(
+    "key", [ORDER, "hosts/toys/order/**", "hosts/toys/*/worker1/1", "*/toys/order/worker1/1", "**"]
+)
+def test_only_the_head_gives_orders(meeting: Meeting, key: str):
     orders: list[bytes] = []
     reports: list[bytes] = []
-    worker.subscribe("order/worker1/1", lambda packet: orders.append(packet.payload))
-    worker.subscribe("report/*/*", lambda packet: reports.append(packet.payload))
+    meeting.worker.subscribe("order/worker1/1", lambda packet: orders.append(packet.payload))
+    meeting.worker.subscribe("report/*/*", lambda packet: reports.append(packet.payload))
+    take = meeting.worker.channel("order/worker1/1")
 
     def all_arrived() -> bool:
-        other.publish("order/worker1/1", b"from worker2")
-        other.publish("report/worker2/1", b"from worker2")
-        head.publish("order/worker1/1", b"from the head")
+        meeting.stranger.put(key, b"from worker2")
+        meeting.other.publish("report/worker2/1", b"from worker2")
+        meeting.head.publish("order/worker1/1", b"from the head")
         return b"from the head" in orders and b"from worker2" in reports
 
     wait_until(all_arrived)
     assert set(orders) == {b"from the head"}
-    for bus in (other, worker, head):
-        bus.close()
+    assert {packet.payload for packet in take()} == {b"from the head"}
+
+
+QUESTION = "hosts/toys/q/join"
+ANSWERS = [
+    *(("hosts/toys", served, answered) for served in (QUESTION, "hosts/**") for answered in (QUESTION, "hosts/**")),
+    ("run", "run/q/join", "run/q/join"),
+    ("run", "**", "run/q/**"),
+]
+
+
+@pytest.mark.parametrize(("meeting", "served", "answered"), ANSWERS, indirect=["meeting"])
+def test_only_the_head_answers(meeting: Meeting, served: str, answered: str):
+    asked = threading.Event()
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            asked.set()
+            query.reply(answered, b"worker2")
+
+    meeting.head.serve("join", lambda _: b"head")
+    queryable = meeting.stranger.declare_queryable(served, answer)
+    deadline = time.monotonic() + 2
+    answers: set[bytes] = set()
+    while time.monotonic() < deadline and not asked.is_set():
+        answers.add(meeting.worker.ask("join", b"", 10))
+    answers |= {meeting.worker.ask("join", b"", 10) for _ in range(20)}
+    queryable.undeclare()
+    assert answers == {b"head"}
 
 
 def test_who_has_the_reader_s_certificate_hears_and_says_nothing(keys: Path):
