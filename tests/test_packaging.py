@@ -233,3 +233,16 @@ def test_the_wheel_runs_its_graphs_from_an_empty_folder(wheel: Path, tmp_path: P
     assert "stages/scene/catalogue.yaml" in installed.runner("info", recording)
     assert "identical" in installed.runner("replay", recording, "--verify")
     assert (installed.folder / "out.csv").read_text().count("\n") == 3
+
+
+@pytest.mark.slow
+def test_the_wheel_makes_a_project_that_runs(wheel: Path, tmp_path: Path):
+    installed = Environment(tmp_path)
+    installed.install("--no-deps", "--no-index", wheel)
+    installed.see(sysconfig.get_path("purelib"))
+    installed.runner("new", "weather")
+    installed.folder /= "weather"
+    assert "COMPLETE" in installed.runner("up", "graph.yaml")
+    (recording,) = (installed.folder / "recordings").glob("*.mcap")
+    assert "IDENTICAL: 21 messages" in installed.runner("replay", recording, "--verify")
+    assert (installed.folder / ".gitignore").is_file()
