@@ -1,11 +1,14 @@
 """Draws the scenes of a suite: `python -m benchmarks.suites NAME SEED... [--sheet PNG]`.
 
-Prints how many draws were rejected, and why; the sheet has a goal and a start image per seed, as the camera sees them.
+Prints how many draws were rejected, and why, for each scene and for all; the sheet has a goal and a start image per
+seed, as the camera sees them.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,12 +27,12 @@ ROOT = Path(__file__).parents[2]
 TILE = 480, 360
 
 
-def looks(suite: str, seeds: Sequence[int]) -> Iterator[tuple[int, Snapshot, Frame]]:
-    """The first look at the goal and at the start scene of each seed, with the truth."""
+def looks(suite: str, seeds: Sequence[int], said: list[str] | None = None) -> Iterator[tuple[int, Snapshot, Frame]]:
+    """The first look at the goal and at the start scene of each seed, with the truth; ``said`` gets what is printed."""
     camera = SimulatedCamera(SimulatedCamera.Config(catalogue=BUILT_IN))
     asked = [message for kind in ("goal", "start") for message in (Arrangement(kind=kind), LookRequest(purpose=kind))]
     for seed in seeds:
-        told = partial(_say, f"{suite} {seed}")
+        told = partial(_say, f"{suite} {seed}", [] if said is None else said)
         shown = run_stage(World(world_config(suite, seed)), asked, log=told)
         for snapshot in shown[1::2]:
             assert isinstance(snapshot, Snapshot)
@@ -44,8 +47,21 @@ def world_config(suite: str, seed: int) -> World.Config:
     return load_graph(ROOT / "graph.yaml", (f"world.suite={suite}", f"world.seed={seed}")).nodes["world"].config
 
 
-def _say(name: str, text: str, level: str) -> None:
+def _say(name: str, said: list[str], text: str, level: str) -> None:
     print(f"{name}: {text}", flush=True)
+    said.append(text)
+
+
+def rejections(said: Sequence[str]) -> str:
+    """What share of all draws was rejected, and why, of the lines that say what was laid out."""
+    why: Counter[str] = Counter()
+    for line in said:
+        if found := re.search(r"draws rejected: (.*)", line):
+            why.update({reason: int(count) for reason, count in re.findall(r"([^,]+?) (\d+)(?:, |$)", found[1])})
+    draws = why.total() + sum("scene laid out" in line for line in said)
+    because = ", ".join(f"{reason} {count}" for reason, count in why.most_common())
+    share = f"{why.total()} of {draws} draws rejected, {why.total() / draws:.0%}"
+    return f"{share}: {because}" if because else share
 
 
 def sheet(rows: list[list[Frame]]) -> Image.Image:
@@ -64,7 +80,9 @@ def main() -> None:
     parser.add_argument("seeds", type=int, nargs="+")
     parser.add_argument("--sheet", type=Path, help="PNG to write")
     options = parser.parse_args()
-    frames = [frame for _, _, frame in looks(options.suite, options.seeds)]
+    said: list[str] = []
+    frames = [frame for _, _, frame in looks(options.suite, options.seeds, said)]
+    print(rejections(said))
     rows = [frames[k : k + 2] for k in range(0, len(frames), 2)]
     if options.sheet:
         sheet(rows).quantize(128, dither=Image.Dither.NONE).save(options.sheet, optimize=True)
