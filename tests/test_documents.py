@@ -1,10 +1,13 @@
 """The documents name only what exists."""
 
 import re
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from runner.hosts import head
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [
@@ -48,3 +51,16 @@ def test_architecture_names_every_stage():
     text = (ROOT / "ARCHITECTURE.md").read_text()
     stages = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", "views"}
     assert {stage for stage in stages if stage not in text} == set()
+
+
+def test_the_keys_between_hosts_are_listed():
+    keys = re.findall(r"^``(\S+)``  ", head.__doc__ or "", re.M)
+    text = (ROOT / "docs" / "runner" / "keys.md").read_text()
+    assert keys
+    assert [key for key in keys if f"| `{key}` |" not in text] == []
+
+
+def test_the_packages_that_the_runner_needs_are_counted():
+    count = len(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"])
+    said = f"{count} needed, {count} known as tested"
+    assert said in (ROOT / "docs" / "runner" / "tools.md").read_text()
