@@ -1,4 +1,5 @@
-"""Goals in, all that are kept on disk out: taught today, restored tomorrow, renamed, edited and deleted."""
+"""Goals in, all that are kept on disk out: taught today or written by hand, restored tomorrow, renamed, edited and
+deleted."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from runner.contract import Context, Refused, Stage
 from stages.messages import Add, Face, Forget, Frame, Goal, Kept, Loosen, Rename, SceneGraph, Strike
 from stages.messages.arrays import Rgb
 from stages.planning.symbolic.pddl import goal_pddl
+from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.facing import faced
 from stages.scene.goals import GoalFolder, check_name, default_folder, loosened, unpacked, without
 
@@ -31,10 +33,13 @@ class Goals(Stage):
     class Config:
         """Where goals are: a folder for each, with the scene, the same as PDDL, and a picture."""
 
+        catalogue: Path = BUILT_IN
+        """What goals that are written by hand may name."""
         folder: Path = field(default_factory=default_folder)
 
     def __init__(self, config: Config) -> None:
-        self._folder = GoalFolder(config.folder)
+        self._catalogue = Catalogue.shared(config.catalogue)
+        self._folder = GoalFolder(config.folder, self._catalogue)
         self._where = config.folder
         self._picture: Rgb | None = None
 
@@ -83,7 +88,7 @@ class Goals(Stage):
 
     def on_add(self, add: Add, ctx: Context) -> Kept:
         """Keeps a goal that was exported."""
-        goal = unpacked(add.file)
+        goal = unpacked(add.file, self._catalogue)
         name = add.name or goal.name
         self._refuse_taken(f"name={name!r}", name)
         return self._write(_changed(name, goal, goal.scene), ctx)
@@ -96,7 +101,7 @@ class Goals(Stage):
         goals, faults = self._folder.read()
         for fault in faults:
             ctx.log(fault, level="warning")
-        return Kept(goals=tuple(goals.values()))
+        return Kept(goals=tuple(goals.values()), faults=tuple(faults))
 
     def _goal(self, name: str) -> Goal:
         goals, _ = self._folder.read()

@@ -21,12 +21,13 @@ from stages.planning.places.hiding import uncovers
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.stepwise import shortened, stepwise
 from stages.planning.symbolic import search
-from stages.planning.symbolic.pddl import DOMAIN, problem_pddl
+from stages.planning.symbolic.pddl import problem_pddl
 from stages.planning.symbolic.problem import TABLE, Problem, cycle, wanted
 from stages.planning.symbolic.search import Solution, Step
 from stages.planning.targets import Blocked, Crowded, Targets, Workspace, neighbours
 from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
+from stages.scene.domain import DOMAIN
 from stages.scene.facing import sides
 from stages.scene.stance import Stances, Standing
 from stages.scene.virtual import fallen, rerooted, satisfied

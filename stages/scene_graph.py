@@ -28,7 +28,7 @@ class SceneGraphBuilder(Stage):
         catalogue: Path
         gap: float = 0.06
         """Objects on the same support with less than this between their footprints are side by side, metres."""
-        radius: float = 0.04
+        radius: float = virtual.RADIUS
         """Radius of the region in which an object counts as still beside the other, metres."""
         tolerances: Tolerances = field(default_factory=Tolerances)
         doubts: bool = False

@@ -27,6 +27,11 @@ def runner(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run((*RUNNER, *arguments), cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
 
 
+BY_HAND = """
+(define (problem tea) (:domain scene) (:objects cup tray - item) (:init) (:goal (in cup tray)))
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_arm_is_stopped_on_its_way_by_a_command_and_by_ctrl_c(
@@ -84,6 +89,9 @@ def of(path: Path, kind: type[M]) -> list[M]:
 def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    by_hand = tmp_path / "scene-programming" / "goals" / "tea" / "goal.pddl"
+    by_hand.parent.mkdir(parents=True)
+    by_hand.write_text(BY_HAND)
     command = (
         *RUNNER,
         "up",
@@ -101,7 +109,7 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
         assert taught.returncode == 0, taught.stdout + taught.stderr
         assert 'goal "breakfast" remembered: 6 objects' in taught.stdout
         unknown = runner("call", "demonstrator", "restore", "name=lunch")
-        assert (unknown.returncode, "no such goal; valid: breakfast" in unknown.stderr) == (2, True)
+        assert (unknown.returncode, "no such goal; valid: breakfast, tea" in unknown.stderr) == (2, True)
         disturbed = runner("call", "world", "arrange", "kind=start")
         assert "start scene laid out" in disturbed.stdout
         restored = runner("call", "demonstrator", "restore", "name=breakfast")
@@ -109,6 +117,8 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
         assert "  success: True" in restored.stdout.splitlines()
         again = runner("call", "demonstrator", "restore", "name=breakfast")
         assert "every relation of the goal holds" in again.stdout
+        tea = runner("call", "demonstrator", "restore", "name=tea")
+        assert "  success: True" in tea.stdout.splitlines(), tea.stdout + tea.stderr
         idle = runner("call", "executor", "stop")
         assert (idle.returncode, "the arm is not under way" in idle.stderr) == (2, True)
         renamed = runner("call", "goals", "rename", "name=breakfast", "to=brunch")
@@ -120,6 +130,7 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
     assert f"recording {recording}: COMPLETE" in printed
     kept = runner("goals", "--graph", "graphs/interactive.yaml").stdout
     assert kept.startswith("brunch\n    6 objects: the ") and "runner call goals forget name=brunch" in kept
+    assert "tea\n    2 objects: the cup and the tray" in kept
     shutil.rmtree(tmp_path / "scene-programming")
     replay = runner("replay", str(recording), "--verify")
     assert replay.returncode == 0, replay.stdout + replay.stderr

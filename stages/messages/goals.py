@@ -10,6 +10,8 @@ class Kept(Message, frozen=True, kw_only=True):
     """All goals that are on disk, by name."""
 
     goals: tuple[Goal, ...]
+    faults: tuple[str, ...] = ()
+    """Folders beside them that hold none, and why."""
 
 
 class Forget(Command, frozen=True, kw_only=True):

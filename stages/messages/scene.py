@@ -102,6 +102,9 @@ class SceneObject(Struct, frozen=True, kw_only=True):
     """Share of its silhouette that nothing hid when it was seen last."""
     probability: float | None = None
     """That the pose is right, as :attr:`ObjectPose.probability`."""
+    anywhere: bool = False
+    """In a goal that was not shown: which side is up is all that the pose says; where the relations hold the object may
+    be anywhere."""
 
 
 class Doubt(Struct, frozen=True, kw_only=True):

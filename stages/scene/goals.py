@@ -16,9 +16,12 @@ import numpy as np
 from runner.contract import Refused
 from runner.message.codec import CodecError, encode
 from stages.messages import Goal, SceneGraph
+from stages.scene.catalogue import Catalogue
+from stages.scene.written import scene_of
 
 SCENE, PDDL, PICTURE = "scene.json", "goal.pddl", "picture.jpg"
-"""The files of a goal. The scene has all of it; the others are the same for planners and for people."""
+"""The files of a goal. The scene has all of it; the others are the same for planners and for people. Where there is no
+scene, the PDDL is the goal, as somebody wrote it."""
 MAX_BYTES = 10_000_000
 """Of a goal."""
 MAX_RADIUS = 0.5
@@ -40,19 +43,20 @@ def check_name(place: str, name: str) -> None:
 class GoalFolder:
     """A folder that holds a folder for each goal. What it holds is read anew each time: others may write to it."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, catalogue: Catalogue) -> None:
+        """``catalogue``: what goals that are written by hand may name."""
+        self._folder, self._catalogue = folder, catalogue
 
     def read(self) -> tuple[dict[str, Goal], list[str]]:
         """All goals by name, and why what else is there is none."""
         goals, faults = dict[str, Goal](), list[str]()
-        for path in sorted(self._folder.glob(f"*/{SCENE}")):
-            name = path.parent.name
+        for folder in sorted({path.parent for file in (SCENE, PDDL) for path in self._folder.glob(f"*/{file}")}):
             try:
-                check_name(str(path.parent), name)
-                goals[name] = goal_of(name, {file.name: file.read_bytes() for file in path.parent.iterdir()})
+                check_name(str(folder), folder.name)
+                files = {file.name: file.read_bytes() for file in folder.iterdir()}
+                goals[folder.name] = goal_of(folder.name, files, self._catalogue)
             except (Refused, OSError) as error:
-                faults.append(f"{path.parent}: {error}")
+                faults.append(f"{folder}: {error}")
         return goals, faults
 
     def write(self, goal: Goal) -> Path:
@@ -76,15 +80,21 @@ def files_of(goal: Goal) -> dict[str, bytes]:
     return {SCENE: scene, PDDL: goal.pddl.encode()} | ({PICTURE: goal.picture} if goal.picture else {})
 
 
-def goal_of(name: str, files: Mapping[str, bytes]) -> Goal:
-    """The goal that was kept; raises Refused where the files are none."""
+def goal_of(name: str, files: Mapping[str, bytes], catalogue: Catalogue) -> Goal:
+    """The goal that was kept, or written by hand; raises Refused where the files are none."""
+    if SCENE not in files and PDDL not in files:
+        raise Refused(f"is no goal: it has neither {SCENE} nor {PDDL}")
     try:
-        scene = msgspec.json.decode(files[SCENE], type=SceneGraph, dec_hook=_array)
         pddl = files.get(PDDL, b"").decode()
+        scene = (
+            msgspec.json.decode(files[SCENE], type=SceneGraph, dec_hook=_array)
+            if SCENE in files
+            else scene_of(pddl, catalogue)
+        )
         goal = Goal(name=name, scene=scene, pddl=pddl, picture=files.get(PICTURE, b""))
         encode(goal)
-    except KeyError:
-        raise Refused(f"is no goal: it has no {SCENE}") from None
+    except Refused as refusal:
+        raise Refused(f"{PDDL}: {refusal}") from None
     except (msgspec.MsgspecError, CodecError, ValueError) as error:
         raise Refused(f"is no goal: {error}") from None
     return goal
@@ -99,19 +109,19 @@ def packed(goal: Goal) -> bytes:
     return file.getvalue()
 
 
-def unpacked(file: bytes) -> Goal:
+def unpacked(file: bytes, catalogue: Catalogue) -> Goal:
     """The goal in a packed file; raises Refused where there is none."""
     try:
         with zipfile.ZipFile(io.BytesIO(file)) as archive:
             members = {tuple(one.filename.split("/")): one for one in archive.infolist()}
-            folder = next((path[0] for path in members if len(path) == 2 and path[1] == SCENE), "")
+            folder = next((path[0] for path in members if len(path) == 2 and path[1] in (SCENE, PDDL)), "")
             if sum(one.file_size for one in members.values()) > MAX_BYTES:
                 raise Refused(f"file: is no goal: unpacked it has more than {MAX_BYTES} bytes")
             files = {path[1]: archive.read(one) for path, one in members.items() if path[:-1] == (folder,)}
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError):
         raise Refused("file: is no goal: expected a file that was exported") from None
     try:
-        return goal_of(folder, files)
+        return goal_of(folder, files, catalogue)
     except Refused as refusal:
         raise Refused(f"file: {refusal}") from None
 

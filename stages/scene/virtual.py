@@ -19,6 +19,8 @@ from stages.scene.stance import Standing, is_tipped
 CLAIMED = 0.85
 """Share of a region's radius within which what is perceived to be in it is said to be: the rest is for perception's
 errors."""
+RADIUS = 0.04
+"""Of a region, metres, unless somebody says otherwise."""
 SYMMETRY_STEP = np.deg2rad(4)
 """Sampling of continuous symmetries when a ring is evaluated, radians: 1 cm at 15 cm from the axis."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -133,6 +133,8 @@ class Story:
         """Ids of what the newest look was asked for by."""
         self._job: Job | None = None
         self._goals: dict[str, Remembered] = {}
+        self._unread: tuple[str, ...] = ()
+        """What else is in the folder of goals, and why it is none."""
         self._photo: Photo | None = None
         self._moved = False
         """Whether something was moved since the picture was taken."""
@@ -175,8 +177,8 @@ class Story:
             case Arrange() | Arrangement() as arranged:
                 self._moved, self._scene = True, None
                 self._draws += arranged.kind == "start"
-            case Kept(goals=goals):
-                self._keep(goals)
+            case Kept(goals=goals, faults=faults):
+                self._keep(goals, faults)
             case Goal() | Verdict() as end:
                 self._end(end, heard.id)
             case _:
@@ -268,10 +270,11 @@ class Story:
     def recall(self) -> None:
         """Takes the goals that are on disk."""
         if self._folder is not None:
-            self._keep(tuple(GoalFolder(self._folder).read()[0].values()))
+            goals, faults = GoalFolder(self._folder, self._catalogue).read()
+            self._keep(goals.values(), faults)
 
-    def _keep(self, goals: tuple[Goal, ...]) -> None:
-        self._goals = {goal.name: Remembered.of(goal) for goal in goals}
+    def _keep(self, goals: Iterable[Goal], faults: Iterable[str]) -> None:
+        self._goals, self._unread = {goal.name: Remembered.of(goal) for goal in goals}, tuple(faults)
 
     # ------------------------------------------------------------------------------------------ what is told
 
@@ -303,6 +306,9 @@ class Story:
             label, now = words.say("do_restore"), self._job is None
             restore = Action(DEMONSTRATOR, "restore", label, asked, kind="first", now=now)
             yield card(kept, (restore,) if self._commanded else (), words)
+        for fault in self._unread:
+            folder, _, why = fault.partition(": ")
+            yield Card(folder, Path(folder).name, why, None, ())
 
     def _doing(self, words: Words) -> Doing:
         job = self._job

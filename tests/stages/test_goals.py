@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import zipfile
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def test_a_goal_goes_to_another_robot(tmp_path: Path) -> None:
     ("content", "reason"),
     [
         (b"nothing", "expected a file that was exported"),
-        ({"tea/other.txt": b""}, "it has no scene.json"),
+        ({"tea/other.txt": b""}, "it has neither scene.json nor goal.pddl"),
         ({"tea/scene.json": b"{}"}, "missing required field `objects`"),
         ({"tea/scene.json": b'{"objects": 1'}, "is no goal"),
         ({"../scene.json": b"{}"}, "is no goal"),
@@ -204,3 +205,64 @@ def test_what_is_not_in_a_goal_cannot_be_struck_out(tmp_path: Path) -> None:
         with pytest.raises(Refused, match=r"neither an object nor a relation of the goal; valid: tray, cup, tea_box"):
             robot.called(Strike(name="tea", what=what))
     assert np.all(robot.scene().T_base_table == TEA.T_base_table)
+
+
+# ----------------------------------------------------------------------------------------------- written by hand
+
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "page.md"
+
+
+def written(folder: Path, name: str) -> Path:
+    """The example of the documentation, as a goal of that name."""
+    (example,) = re.findall(r"```lisp\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (folder / name).mkdir(parents=True)
+    file = folder / name / "goal.pddl"
+    file.write_text(example)
+    return file
+
+
+def asked_for(robot: Robot) -> str:
+    (goal,) = robot.kept.goals
+    return goal.pddl.partition("(:goal")[2]
+
+
+def test_a_goal_written_by_hand_is_kept_like_one_that_was_taught(tmp_path: Path) -> None:
+    file = written(tmp_path, "tea-for-two")
+    robot = Robot(tmp_path)
+    assert robot.ctx.lines == []
+    goal = robot.goals()["tea-for-two"]
+    assert goal.pddl == file.read_text() and goal.picture == b""
+    assert [item.name for item in goal.scene.objects] == ["tray", "cup", "cup_2", "tea_box", "salt_shaker"]
+    assert {"in(cup, tray)", "in(cup_2, tray)", "on(salt_shaker, tea_box)", "clear(cup)"} <= facts(goal.scene)
+    robot.called(Strike(name="tea-for-two", what="clear(cup)"))
+    assert "clear(cup)" not in facts(robot.scene()) and "(clear cup)" not in asked_for(robot)
+    assert all(item.anywhere for item in robot.scene().objects) and "xyz" not in robot.kept.goals[0].pddl
+    robot.called(Rename(name="tea-for-two", to="tea"))
+    there = Robot(tmp_path / "there")
+    there.called(Add(file=packed(robot.kept.goals[0])))
+    assert encode(there.kept) == encode(robot.kept)
+    robot.called(Forget(name="tea"))
+    assert robot.kept.goals == () and list(tmp_path.iterdir()) == [tmp_path / "there"]
+
+
+def test_a_goal_written_by_hand_goes_to_another_robot_as_it_is(tmp_path: Path) -> None:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.write(written(tmp_path / "here", "tea"), "tea/goal.pddl")
+    there = Robot(tmp_path / "there")
+    there.called(Add(file=file.getvalue()))
+    assert facts(there.scene()) == facts(Robot(tmp_path / "here").scene())
+
+
+def test_what_is_wrong_with_a_goal_written_by_hand_is_named_and_others_are_kept(tmp_path: Path) -> None:
+    Robot(tmp_path).taught("tea")
+    file = written(tmp_path, "mess")
+    file.write_text(file.read_text().replace("(clear cup)", "(clear fork)"))
+    robot = Robot(tmp_path)
+    assert list(robot.goals()) == ["tea"]
+    (line,) = robot.ctx.lines
+    assert re.fullmatch(
+        rf"{tmp_path}/mess: goal.pddl: line \d+: 'fork': not among the objects; valid: table, tray, cup, .*", line
+    )
+    assert robot.kept.faults == (line,)

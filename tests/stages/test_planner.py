@@ -26,6 +26,7 @@ from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
 from stages.scene.virtual import rerooted, satisfied
+from stages.scene.written import scene_of
 from tests.stages.episodes import Recorded
 from tests.stages.layouts import CATALOGUE, T_BASE_CAMERA, T_BASE_TABLE, Layout, breakfast, catalogue, label_of, stances
 from tests.stages.planning.scenes import ROBOT
@@ -115,6 +116,49 @@ def test_plans_are_deterministic():
     assert first.actions == second.actions
     for a, b in zip(first.transfers, second.transfers, strict=True):
         assert np.array_equal(a.T_base_targets, b.T_base_targets)
+
+
+BY_HAND = """
+(define (problem by-hand)
+  (:domain scene)
+  (:objects tray bowl cup tea_box tuna_can soup_can - item)
+  (:init)
+  (:goal (and (in bowl tray) (in cup bowl) (in tea_box tray) (on tuna_can tea_box) (on soup_can table))))
+"""
+
+
+def by_hand(text: str, current: Layout) -> Plan:
+    return planner().on_task(
+        Task(goal_name="by-hand", goal=scene_of(text, catalogue()), current=current.graph()), Recorded()
+    )
+
+
+def test_a_goal_written_by_hand_is_reached_wherever_there_is_room():
+    found = by_hand(BY_HAND, START)
+    assert {(one.object, one.destination) for one in found.transfers} == {
+        *(("soup_can", "table"), ("tuna_can", "tea_box"), ("bowl", "tray"), ("cup", "bowl")),
+    }
+    after = executed(START, found)
+    assert satisfied(scene_of(BY_HAND, catalogue()), after.graph(), catalogue())[1] == ()
+    assert penetrations(after) == []
+
+
+def test_what_may_be_anywhere_on_the_table_stays_near_and_what_is_not_named_stays():
+    found = by_hand(BY_HAND.replace("tuna_can", "").replace("(on  tea_box)", "(clear tea_box)"), START)
+    assert "tuna_can" not in {one.object for one in found.transfers}
+    can = next(one for one in found.transfers if one.object == "soup_can")
+    start = (T_BASE_TABLE @ START.poses["soup_can"])[:2, 3]
+    assert np.linalg.norm(can.T_base_targets[0][:2, 3] - start) < 0.3
+
+
+def test_what_lies_is_set_upright_for_a_goal_written_by_hand():
+    text = "(define (problem up) (:domain scene) (:objects milk_carton - item) (:init) (:goal (on milk_carton table)))"
+    lying = Layout().put("milk_carton", 0.0, 0.0, resting=1)
+    found = by_hand(text, lying)
+    assert found.status == "solved"
+    after = executed(lying, found)
+    assert satisfied(scene_of(text, catalogue()), after.graph(), catalogue())[1] == ()
+    assert by_hand(text, Layout().put("milk_carton", 0.0, 0.0)).status == "satisfied"
 
 
 def test_picks_and_places_are_paired():

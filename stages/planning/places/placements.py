@@ -113,6 +113,7 @@ class Placements:
         self._taught = {(item.parent, item.child): item for item in taught.virtual_objects}
         self._labels = {item.name: item.label for item in goal.objects}
         self._poses = {item.name: item.T_base_object for item in goal.objects}
+        self._anywhere = {item.name for item in goal.objects if item.anywhere}
         self._virtual = {item.name: item for item in goal.virtual_objects}
         self._stances = stances
         self._sides = sides(goal)
@@ -183,7 +184,8 @@ class Placements:
             parent = scene.standing[virtual.parent]
             poses = region_poses(virtual, parent.T_table_object, parent.stance.item.symmetries)
         elif step.destination == TABLE:
-            return [inverse(scene.T_base_table) @ self._poses[step.item]]
+            anywhere = step.item in self._anywhere
+            return [self._centred(step, scene) if anywhere else inverse(scene.T_base_table) @ self._poses[step.item]]
         else:
             support = scene.standing[step.destination]
             relative = inverse(self._goal.standing[step.destination].T_table_object) @ self._shown(step.item)
@@ -212,7 +214,8 @@ class Placements:
         return self._goal.standing[name].T_table_object
 
     def _centred(self, step: Step, scene: Scene) -> Floats:
-        """The middle of the support, where it now stands so that the demonstrated relative pose means nothing."""
+        """The middle of the support, where it now stands so that the demonstrated relative pose means nothing; on the
+        table above where the object is now."""
         T = self._shown(step.item).copy()
         carrier = scene.standing.get(step.destination)
         T[:2, 3] = regions.centroid(carrier.top) if carrier else scene.standing[step.item].T_table_object[:2, 3]

@@ -7,8 +7,9 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from runner.contract import Refused
-from stages.planning.symbolic.pddl import DOMAIN, fact, symbol
+from stages.planning.symbolic.pddl import fact
 from stages.planning.symbolic.problem import TABLE, Problem
+from stages.scene.domain import DOMAIN, symbol
 
 BFS = "bfs"
 """The engine that is always there: :func:`breadth_first`."""
@@ -43,7 +44,7 @@ class Solution:
 
 
 def actions(step: Step, problem: Problem) -> tuple[str, str]:
-    """The pick and the place of a step as ground PDDL actions of :data:`~stages.planning.symbolic.pddl.DOMAIN`."""
+    """The pick and the place of a step as ground PDDL actions of :data:`~stages.scene.domain.DOMAIN`."""
     pick = fact("pick-from" if step.source in problem.concave else "pick", step.item, step.source)
     if step.region:
         return pick, fact("place-at-region", step.item, step.region, step.parent, step.destination)

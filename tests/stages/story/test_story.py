@@ -305,7 +305,7 @@ def test_a_goal_that_is_kept_can_be_edited_and_carried_away(tmp_path: Path) -> N
         ("forget", {"name": "tea"}, "Delete “tea” for good?"),
     ]
     assert card.file is not None and card.file.name == "tea.zip"
-    assert encode(unpacked(card.file.data.tobytes())) == encode(goal)
+    assert encode(unpacked(card.file.data.tobytes(), Catalogue.shared(BUILT_IN))) == encode(goal)
     assert [(line.text, *(one.arguments.get("what") or one.label for one in line.actions)) for line in card.lines] == [
         ("The tray is on the table.", "on(tray, table)", "tray"),
         ("The cup is in the tray.", "in(cup, tray)", "cup"),
@@ -332,11 +332,22 @@ def test_a_goal_may_be_recorded_after_it_was_kept(tmp_path: Path) -> None:
 
 
 def test_what_is_on_disk_is_told_without_a_run(tmp_path: Path) -> None:
-    GoalFolder(tmp_path).write(Goal(name="tea", scene=GOAL, pddl=""))
+    GoalFolder(tmp_path, Catalogue.shared(BUILT_IN)).write(Goal(name="tea", scene=GOAL, pddl=""))
     listener = Listener(goals={"folder": tmp_path})
     assert listener.told().cards == ()
     listener.story.recall()
     assert [card.title for card in listener.told("de").cards] == ["tea"]
+
+
+def test_what_is_no_goal_is_told_with_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "mess").mkdir()
+    (tmp_path / "mess" / "goal.pddl").write_text("(define (problem mess)")
+    listener = Listener(goals={"folder": tmp_path})
+    listener.story.recall()
+    (card,) = listener.told().cards
+    assert card.title == "mess" and card.text.startswith("goal.pddl: line 1: ") and card.actions == ()
+    listener.hear(Kept(goals=()))
+    assert listener.told().cards == ()
 
 
 @pytest.mark.parametrize("command_first", [True, False])

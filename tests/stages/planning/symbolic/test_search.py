@@ -22,9 +22,10 @@ from unified_planning.shortcuts import PlanValidator, get_environment
 from runner.contract import Refused
 from stages.messages import SceneGraph, VirtualObject
 from stages.messages.scene import SceneObject
-from stages.planning.symbolic.pddl import DOMAIN, problem_pddl
+from stages.planning.symbolic.pddl import problem_pddl
 from stages.planning.symbolic.problem import Problem, VirtualRegion
 from stages.planning.symbolic.search import Solution, actions, breadth_first, check_engine, with_engine
+from stages.scene.domain import DOMAIN
 
 get_environment().credits_stream = None
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # unified-planning's use of pyparsing.
