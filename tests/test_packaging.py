@@ -128,7 +128,7 @@ def test_every_requirement_has_its_tested_version():
         *PROJECT["dependencies"],
         *(name for extra in ("stages", "view", "page", "dev") for name in EXTRAS[extra]),
     ]
-    assert {name for name in required if key(name.partition("[")[0]) not in pinned} == set()
+    assert {name for name in required if key(re.split(r"[\[;]", name)[0]) not in pinned} == set()
 
 
 # ------------------------------------------------------------------------------------------ what is installed
