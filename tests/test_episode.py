@@ -81,7 +81,7 @@ def test_a_zenoh_subscriber_hears_every_message_of_the_job_once_and_byte_for_byt
         "--set",
         "world.seed=3",
         "--set",
-        "corrector.calibrate=false",
+        "corrector.calibrate=false",  # the job above calibrates; here it would only take longer
         "--set",
         f"listen={address}",
         "--recordings",
