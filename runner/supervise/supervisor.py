@@ -103,6 +103,8 @@ class Supervisor:
         self._numbering = threading.Condition()
         self._publishing = 0
         """Messages of the supervisor's own that have a number and no step yet."""
+        self._journalling = threading.Lock()
+        """Held while a step is sent, for they are sent in the order of their numbers."""
         self._own_steps = 0
         self._has_ended = threading.Event()
         """Once the recorder has the supervisor's last step."""
@@ -210,7 +212,7 @@ class Supervisor:
         return own
 
     def _journal(self, emitted: tuple[str, ...], outcome: Outcome = "done") -> None:
-        with self._numbering:
+        with self._journalling:
             step = Step(*self._own, self._own_steps, "", (), emitted, time.time_ns(), 0, 0, 0, outcome)
             self._own_steps += 1
             self._bus.publish(f"s/{SUPERVISOR}", codec.pack(step))
