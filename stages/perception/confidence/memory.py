@@ -30,7 +30,9 @@ right."""
 _THROUGH = 0.01
 """Metres by which an object that is remembered must reach into a surer one that is seen to be no more there."""
 _CONTENT = 0.5
-"""Share of a container's footprint up to which something may stand in it."""
+"""Share of a container's footprint up to which something may stand in it wherever its floor is."""
+_BESIDE = 0.005
+"""Metres that something may be estimated beside the floor on which it stands."""
 
 
 class Memory:
@@ -122,12 +124,13 @@ class Memory:
         return inverse_depth(shape.soup, inverse(observation.T_base_camera) @ item.T_base_object, view.view)
 
     def _overlap(self, item: SceneObject, stranger: SceneObject, scene: SceneGraph, depth: float = 0.0) -> bool:
-        """Whether not both can stand there, by more than ``depth`` metres; what is small beside a container may be in
-        it."""
+        """Whether not both can stand there, by more than ``depth`` metres; what is small beside a container, or stands
+        on its floor, may be in it."""
         a, b = standing_of((item, stranger), self._stances, scene.T_base_table)
         areas = [regions.area(one.outline) for one in (a, b)]
-        outer = a if areas[0] > areas[1] else b
-        if outer.stance.cavity and min(areas) < _CONTENT * max(areas):
+        outer, inner = (a, b) if areas[0] > areas[1] else (b, a)
+        fits = regions.inside(inner.bottom, outer.floor, margin=-_BESIDE)
+        if outer.stance.cavity and (fits or min(areas) < _CONTENT * max(areas)):
             return False
         level = a.z_bottom < b.z_top and b.z_bottom < a.z_top
         return level and regions.separation(a.outline, b.outline) < -depth

@@ -173,6 +173,15 @@ def test_what_is_in_a_container_does_not_reach_into_it() -> None:
         assert names(scene) == [container, "tuna_can"]
 
 
+def test_what_surely_stands_in_a_mug_does_not_say_that_there_is_none() -> None:
+    layout = Layout().put("mug", 0.0, 0.0).put("water_bottle", -0.0115, 0.0, on="mug")
+    before = known(layout.poses)
+    before["mug"] = msgspec.structs.replace(before["mug"], probability=0.77)
+    sure = tuple(msgspec.structs.replace(item, probability=0.99) for item in graph(layout.poses).objects[1:])
+    seen = msgspec.structs.replace(graph({"water_bottle": layout.poses["water_bottle"]}), objects=sure)
+    assert names(MEMORY.complete(seen, before, observation(layout.poses))) == ["water_bottle", "mug"]
+
+
 def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
     """Two sponges, of which the hand has put the first where the look now calls it another one."""
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
