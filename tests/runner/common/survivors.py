@@ -209,7 +209,7 @@ class Picture(Message, frozen=True, kw_only=True):
 
 
 class Camera(Stage):
-    """Sends pictures as fast as it can."""
+    """Sends pictures as fast as it can, or as fast as somebody takes them."""
 
     device = True
 
@@ -219,14 +219,19 @@ class Camera(Stage):
         size: int = 1_000_000
         go: Path | None = None
         """Waits until this file is there."""
+        taken: Path | None = None
+        """Sends no picture before this file has a byte for each that came before it."""
 
     def __init__(self, config: Config):
         self._config = config
 
     def source(self, ctx: Context) -> Iterator[Picture]:
-        while self._config.go is not None and not self._config.go.exists():
+        go, taken = self._config.go, self._config.taken
+        while go is not None and not go.exists():
             time.sleep(0.01)
         for number in range(self._config.count):
+            while taken is not None and taken.stat().st_size < number:
+                time.sleep(0.01)
             yield Picture(pixels=np.full(self._config.size, number, np.uint8), last=number == self._config.count - 1)
 
 
