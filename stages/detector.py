@@ -14,7 +14,7 @@ from runner.contract import Context, Refused, Stage
 from stages.devices.bop_detections import Detection, read_detections
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate, Candidates, Frame
-from stages.perception.hypotheses.duplicates import unrepeated
+from stages.perception.hypotheses.duplicates import SHARED, shared, unrepeated
 from stages.scene.catalogue import Catalogue
 
 _FAR = np.float32(100.0)
@@ -181,11 +181,16 @@ class RecordedDetections(Stage):
 def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int = 0) -> Candidates:
     """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt.
 
-    Of these, labels that are seen elsewhere come last: most objects are there once.
+    Of these, labels that are surely seen come last: most objects are there once. But what is surely seen in a box about
+    this one comes first: two equal objects, of which one hides part of the other, the detector frames as one.
     """
     best, score = confidences.argmax(1), confidences.max(1, initial=0.0)
-    elsewhere = np.isin(np.arange(len(labels)), best[score >= _SURE])
-    orders = np.lexsort((-confidences, np.broadcast_to(elsewhere, confidences.shape)))
+    sure = np.flatnonzero(score >= _SURE)
+    ranks = np.zeros(confidences.shape)
+    ranks[:, best[sure]] = 1
+    for rank, box in zip(ranks, boxes, strict=True):
+        rank[[best[k] for k in sure if shared(boxes[k], box) > SHARED]] = -1
+    orders = np.lexsort((-confidences, ranks))
     candidates = tuple(
         Candidate(
             box=box,

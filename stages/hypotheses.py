@@ -24,6 +24,8 @@ from stages.perception.hypotheses.composition import FirstLook, charge
 from stages.perception.hypotheses.duplicates import unrepeated
 from stages.perception.hypotheses.revisions import (
     Revision,
+    combined,
+    equalled,
     is_better,
     new_offers,
     refitted,
@@ -126,9 +128,11 @@ class Hypotheses(Stage):
             # What else made the scene better was not in vain.
             several = sum(is_better(each.log_weight, known) for each in posteriors) > 1
             before = () if several else search.unexplained
-            revised = revisions(best, search.offers, before)[: self.config.finalists]
+            revised = combined(posteriors, earlier, search.offers)[: self.config.finalists]
+            revised += revisions(best, search.offers, before)[: self.config.finalists]
             revised += relabelled(best, search.offers, before)[: self.config.finalists]
-            revised += [each for each in refitted(best, search.offers) if each not in revised]
+            others = refitted(best, search.offers) + equalled(best, search.offers)
+            revised += [each for each in dict.fromkeys(others) if each not in revised]
             revised += suggested(best, search.offers, before)[: self.config.finalists]
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained or fits badly")

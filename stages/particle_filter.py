@@ -115,8 +115,11 @@ class ParticleFilter(Stage):
         tracks = [found.track for found in result.objects]
         # In one that is dropped nobody looks for what has no start.
         objects = [_object(*each) for each in zip(names, hypothesis.candidates, result.objects, strict=False)]
-        charges = hypothesis.charges + self._charges(scene, hypothesis, objects, tracks)
-        suggests = search is not None and search.suggestions and not result.dropped
+        new_charges = self._charges(scene, hypothesis, objects, tracks)
+        charges = hypothesis.charges + new_charges
+        # Nobody goes on from what is worse than the scene that is known.
+        best = result.cost + sum(new_charges) <= reached
+        suggests = search is not None and search.suggestions and best
         return Posterior(
             index=hypothesis.index,
             count=hypothesis.count,
@@ -143,11 +146,13 @@ class ParticleFilter(Stage):
     def _charges(
         self, scene: ObservedScene, hypothesis: Hypothesis, objects: Sequence[ObjectPose], tracks: Sequence[Track]
     ) -> tuple[float, ...]:
-        """What the objects that were looked for among the others cost by being there; nothing where one must be."""
+        """What the objects that were looked for among the others cost by being there; where one must be, no more than
+        those did in whose place it comes."""
         first = len(hypothesis.charges)
+        before = hypothesis.incumbent_charged - hypothesis.charged
         new = zip(hypothesis.candidates[first:], tracks[first:], hypothesis.shares, strict=False)
         return tuple(
-            0.0
+            before
             if self._suggestions.carries(scene, objects, k)
             else charge(candidate.box, self._start(scene, _suspect(candidate), track), share)
             for k, (candidate, track, share) in enumerate(new, first)

@@ -33,5 +33,13 @@ def box_of(mask: Mask) -> Floats:
     return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
 
 
+def part_of(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
+    """The smallest part of the image outside of which nothing is true, and so many pixels around it: most objects are
+    small."""
+    spans = (np.flatnonzero(mask.any(axis)).tolist() for axis in (1, 0))
+    rows, columns = (slice(max(0, s[0] - margin), s[-1] + 1 + margin) if s else slice(0, 0) for s in spans)
+    return rows, columns
+
+
 def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)

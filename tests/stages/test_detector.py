@@ -105,6 +105,15 @@ def test_labels_that_are_seen_elsewhere_are_doubted_last() -> None:
     assert message.candidates[1].label == "bowl" and message.candidates[1].others == ("soup_can", "mug", "cup")
 
 
+def test_what_is_in_the_box_of_a_sure_object_may_well_be_an_equal_of_it() -> None:
+    stage = Detector(Detector.Config(labels=("bowl", "cup", "mug", "soup_can")))
+    confidences = np.array([[0.0, 0.95, 0.0, 0.01], [0.6, 0.1, 0.2, 0.1]])
+    boxes = np.array([[100.0, 100, 160, 200], [110, 170, 150, 198]])
+    stage._detect = lambda *_, **__: Detections(boxes, confidences)
+    (message,) = run_stage(stage, [frame(np.zeros((240, 320, 3), np.uint8))])
+    assert message.candidates[1].label == "bowl" and message.candidates[1].others == ("cup", "mug", "soup_can")
+
+
 def test_objects_known_to_be_there_are_doubted_rather_than_missed(image: np.ndarray) -> None:
     sure = candidates(image, expected=0).candidates
     assert len(candidates(image, expected=len(sure)).candidates) == len(sure)

@@ -286,6 +286,24 @@ def test_what_shows_an_object_once_more_may_show_what_carries_it(filter_stage: P
         assert {item.label for item in estimate.objects} == labels
 
 
+@pytest.mark.parametrize("yaw", [0.2, 0.6, 1.2])
+def test_two_equal_objects_that_the_detector_frames_as_one_are_two(yaw: float, filter_stage: ParticleFilter) -> None:
+    """A sponge on a sponge: what shows of the lower one is covered by a can as well as noisy readings tell."""
+    upper = upright("sponge", 0.005, 0.01, 0.0)
+    upper[2, 3] += CATALOGUE["sponge"].dimensions[2]
+    tower = render({"sponge": upper, "sponge_2": upright("sponge", 0.0, 0.0, yaw)})
+    (x0, y0, x1, _), (left, _, right, bottom) = tower.boxes["sponge"], tower.boxes["sponge_2"]
+    stack = np.array([min(x0, left), y0, max(x1, right), bottom])
+    front = np.array([left, 0.75 * bottom + 0.25 * y0, right, bottom])
+    found = candidates(("sponge", stack, 0.95), ("tuna_can", front, 0.34))
+    doubted = msgspec.structs.replace(found.candidates[1], others=("sponge", "mug"))
+    found = msgspec.structs.replace(found, candidates=(found.candidates[0], doubted))
+    config = Hypotheses.Config(n_objects="auto")
+    (observation, *hypotheses), _ = enumerate_(config, frame(tower), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert [item.label for item in estimate.objects] == ["sponge", "sponge"]
+
+
 def test_what_nothing_explains_is_looked_for_though_no_box_shows_it(filter_stage: ParticleFilter) -> None:
     """A cup half behind a carton, that the detector does not see at all."""
     partly = {"cereal_box": upright("cereal_box", 0.0, 0.0, 0.3), "cup": upright("cup", 0.09, 0.09, 0.0)}

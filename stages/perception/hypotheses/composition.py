@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
+from stages.geometry.masks import part_of
 from stages.messages.digest import PATCH_STRIDE, DepthPatch, LonePose
 from stages.perception.filter.likelihood import CostForm, ObservedScene, credits
 from stages.perception.filter.particle_filter import pixels
@@ -57,7 +58,7 @@ class Composition:
         nearest = self.scene.plane_inverse.copy()
         allowed = np.ones_like(self.scene.foreground)
         for layer, reach in zip(layers, self._reaches if reaches is None else reaches, strict=True):
-            part = _part(layer > 0)
+            part = part_of(layer > 0)
             nearer = layer[part] > nearest[part]
             np.copyto(nearest[part], layer[part], where=nearer)
             np.copyto(allowed[part], reach[part], where=nearer)
@@ -84,7 +85,7 @@ def pixel_costs(
     false the object in sight leaves the reading unexplained.
     """
     shown = (nearest > scene.plane_inverse) & (scene.factor > 0)
-    part = _part(shown)
+    part = part_of(shown)
     shown, before = shown[part], credit[part]
     behind = scene.factor[part] * (1.0 / np.where(shown, nearest[part], 1.0) - scene.depth[part])
     distance = np.minimum(np.abs(behind), form.truncation)
@@ -140,7 +141,7 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
 
     ``layer`` and ``others`` are H x W inverse depths of the object and of all else.
     """
-    part = _part(layer > 0)
+    part = part_of(layer > 0)
     layer, factor = layer[part], scene.factor[part]
     silhouette = layer > 0
     behind = factor * (1.0 / np.where(silhouette, layer, 1.0) - scene.depth[part])
@@ -154,7 +155,7 @@ def fit(scene: ObservedScene, layer: Float32s, others: Float32s, form: CostForm)
 def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) -> DepthPatch:
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse
-    rows, columns = part = _part(shown[::PATCH_STRIDE, ::PATCH_STRIDE])
+    rows, columns = part = part_of(shown[::PATCH_STRIDE, ::PATCH_STRIDE])
     composition = Composition(scene, form, [box])
     change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
     inverse, change = (np.where(shown, a, 0.0)[::PATCH_STRIDE, ::PATCH_STRIDE][part] for a in (layer, change))
@@ -190,12 +191,6 @@ class FirstLook:
             np.copyto(self._inverse[part], one.inverse, where=nearer)
             np.copyto(self._change[part], one.change, where=nearer)
         return _sum(self._change) * PATCH_STRIDE**2 + sum(self._charges[i] for i in chosen)
-
-
-def _part(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """The smallest part of the image outside of which nothing is shown; most objects are small."""
-    rows, columns = (np.flatnonzero(shown.any(axis)).tolist() for axis in (1, 0))
-    return np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] if rows else np.s_[0:0, 0:0]
 
 
 def _mask(scene: ObservedScene, rectangle: tuple[int, int, int, int]) -> NDArray[np.bool_]:

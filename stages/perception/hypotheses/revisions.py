@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from stages.messages.digest import Offer, Posterior
+from stages.messages.digest import Contender, Offer, Posterior
 from stages.messages.scene import ObjectPose
 from stages.perception.detection.boxes import intersection_over_union
 from stages.perception.hypotheses.duplicates import SHARED, shared
@@ -46,7 +46,7 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
     last round revised, that was in vain.
     """
     everything = tuple(range(len(best.objects)))
-    chosen = _chosen(best, offers)
+    chosen = _chosen(best.objects, offers)
     without = {k: tuple(j for j in everything if j != i) for k, i in chosen.items()}
     unseen = [k for k, i in chosen.items() if best.objects[i].visible < _UNSEEN]
     left_open = _left_open(best, before)
@@ -66,7 +66,7 @@ def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
 def relabelled(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
     """Revisions in which what a box leaves unexplained is an object by another label, in the place of the one that came
     from that box, if there is any; as :func:`revisions`."""
-    chosen = _chosen(best, offers)
+    chosen = _chosen(best.objects, offers)
     instead = [k for k in _left_open(best, before) if offers[k].instead and k not in chosen]
     taken = [{i for other, i in chosen.items() if _same_box(offers[k], offers[other])} for k in instead]
     return [
@@ -86,7 +86,7 @@ def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
     *others, worst = sorted(best.objects, key=lambda item: item.cost)
     if worst.cost < _MISFIT * np.median([item.cost for item in others]):
         return []
-    kept, chosen = tuple(i for i, item in enumerate(best.objects) if item is not worst), _chosen(best, offers)
+    kept, chosen = tuple(i for i, item in enumerate(best.objects) if item is not worst), _chosen(best.objects, offers)
     doubled = any(np.array_equal(item.box, worst.box) for item in others)
     boxes = {k: offer.candidate.box for k, offer in enumerate(offers) if offer.instead and k not in chosen}
     return [
@@ -94,6 +94,20 @@ def refitted(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
         for k, box in boxes.items()
         if np.array_equal(box, worst.box) or (doubled and shared(box, worst.box) > SHARED)
     ]
+
+
+def equalled(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
+    """Revisions in which what stands in the box of another object is an equal of that: the detector frames two equal
+    objects, of which one hides part of the other, as one."""
+    chosen = _chosen(best.objects, offers)
+    return [
+        Revision(tuple(i for i in range(len(best.objects)) if i != gone), (k,))
+        for other, gone in chosen.items()
+        for k, offer in enumerate(offers)
+        if offer.instead and k not in chosen and _same_box(offer, offers[other])
+        and any(item.label == offer.candidate.label and shared(item.box, offer.candidate.box) > SHARED
+                for item in best.objects)
+    ]  # fmt: skip
 
 
 def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
@@ -108,6 +122,26 @@ def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] 
     ]
 
 
+def combined(posteriors: Sequence[Posterior], earlier: Sequence[Contender], offers: Sequence[Offer]) -> list[Revision]:
+    """Revisions that do to the best scene of a round what made others of it better, too, the best first; but what
+    concerns the boxes that it changed itself. All of them revised the best of the ``earlier`` scenes."""
+    if not earlier:
+        return []
+    revised = max(earlier, key=lambda each: each.log_weight)
+    ranked = sorted(posteriors, key=lambda each: -each.log_weight)
+    best, *others = (each for each in ranked if is_better(each.log_weight, revised.log_weight))
+    chosen, before = _chosen(best.objects, offers), _chosen(revised.objects, offers).keys()
+    changed = before ^ chosen.keys()
+    found: list[Revision] = []
+    for other in others:
+        after = _chosen(other.objects, offers).keys()
+        gone, new = before - after, sorted(after - before)
+        boxes = ((offers[k].candidate.box, offers[c].candidate.box) for k, c in product(gone | {*new}, changed))
+        if not any(shared(*pair) > SHARED for pair in boxes):
+            found.append(Revision(tuple(i for k, i in chosen.items() if k not in gone), tuple(new)))
+    return found
+
+
 def new_offers(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
     """Those of some suggestions that were not made before."""
     return [each for each in suggestions if not any(_same(each, offer) for offer in offers)]
@@ -118,9 +152,9 @@ def is_better(log_weight: float, known: float) -> bool:
     return log_weight > (1 - _GAIN) * known
 
 
-def _chosen(best: Posterior, offers: Sequence[Offer]) -> dict[int, int]:
-    """The objects of the best scene by their offers."""
-    return {_index(item, offers): i for i, item in enumerate(best.objects)}
+def _chosen(objects: Sequence[ObjectPose], offers: Sequence[Offer]) -> dict[int, int]:
+    """The indices of a scene's objects by their offers."""
+    return {_index(item, offers): i for i, item in enumerate(objects)}
 
 
 def _left_open(best: Posterior, before: Sequence[float]) -> list[int]:

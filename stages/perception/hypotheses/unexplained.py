@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.geometry.masks import Mask, box_of, dilated, eroded, opened
-from stages.geometry.poses import rotate
+from stages.geometry.masks import Mask, dilated, eroded, opened, part_of
+from stages.geometry.poses import along, rotate
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Float32s
 
@@ -51,8 +51,12 @@ def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[U
     there they may be of either side, or of neither.
     """
     lonely = opened(unexplained(scene, layers, edge=_edge(scene)), 1 + _edge(scene) // 2)
-    count, labels = cv2.connectedComponents(lonely.astype(np.uint8), connectivity=8)
-    found = [_region(scene, labels == number) for number in range(1, count)]
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(lonely.astype(np.uint8), connectivity=8)
+    found = [
+        _region(scene, labels[y : y + height, x : x + width] == number, x, y)
+        for number, (x, y, width, height, _) in enumerate(boxes.tolist())
+        if number > 0
+    ]
     # How components are numbered may depend on the number of threads; their order here must not.
     return tuple(sorted(filter(None, found), key=lambda region: (-region.points, *region.box.tolist())))
 
@@ -63,10 +67,14 @@ def looked_through(scene: ObservedScene, layer: Float32s, others: Float32s) -> f
     ``layer`` and ``others`` are H x W inverse depths of the object, and of the plane and all other objects. 0 where
     there are no readings: no evidence.
     """
+    if not layer.any():
+        return 0.0
+    part = part_of(layer > 0)
+    layer, depth = layer[part], scene.depth[part]
     inner = eroded(layer > 0, max(1, _edge(scene) // 2))
-    seen = inner & (layer >= others) & (scene.factor > 0)
-    behind = scene.depth - 1.0 / np.where(seen, layer, 1.0)
-    through = seen & (behind > _margin(scene))
+    seen = inner & (layer >= others[part]) & (scene.factor[part] > 0)
+    behind = depth - 1.0 / np.where(seen, layer, 1.0)
+    through = seen & (behind > _margin(depth))
     return float(through.sum() / max(1, seen.sum()))
 
 
@@ -78,19 +86,21 @@ def is_contradicted(share: float) -> bool:
 def unexplained(scene: ObservedScene, layers: Sequence[Float32s], *, edge: int) -> Mask:
     """Readings above the plane that lie on no object, and not within ``edge`` pixels of a silhouette, H x W."""
     normal, offset = scene.plane[:3], scene.plane[3]
-    above = ((scene.view.rays() * normal).sum(-1) * scene.depth + offset) > _HEIGHT * _growth(scene)
+    above = (along(scene.view.rays(), normal.astype(float)) * scene.depth + offset) > _HEIGHT * _growth(scene.depth)
     open_readings = scene.foreground & above
-    margin = _margin(scene)
-    for layer in layers:
-        shown = layer > 0
-        on_it = shown & (np.abs(1.0 / np.where(shown, layer, 1.0) - scene.depth) < margin)
+    for layer in filter(np.any, layers):
+        part = part_of(layer > 0, edge)
+        shown, depth = layer[part] > 0, scene.depth[part]
+        on_it = shown & (np.abs(1.0 / np.where(shown, layer[part], 1.0) - depth) < _margin(depth))
         rim = dilated(shown, edge) & ~eroded(shown, edge)
-        open_readings &= ~(on_it | rim)
+        open_readings[part] &= ~(on_it | rim)
     return open_readings
 
 
-def _region(scene: ObservedScene, mask: Mask) -> UnexplainedRegion | None:
-    rows, columns = np.nonzero(mask)
+def _region(scene: ObservedScene, part: Mask, left: int, top: int) -> UnexplainedRegion | None:
+    """The readings of a part of the image that begins at a pixel; None where they are too few."""
+    rows, columns = np.nonzero(part)
+    rows, columns = rows + top, columns + left
     z = scene.depth[rows, columns].astype(np.float64)
     if len(rows) < _POINTS or float((z**2).sum()) / (scene.view.fx * scene.view.fy) < _AREA:
         return None
@@ -99,16 +109,17 @@ def _region(scene: ObservedScene, mask: Mask) -> UnexplainedRegion | None:
     low, high = np.percentile(rotate(T[:3, :3].T, points), [2, 98], axis=0)
     if high[2] < _TOP:
         return None
-    return UnexplainedRegion(box_of(mask), len(rows), (low + high) / 2, high - low)
+    box = np.array([left, top, left + part.shape[1], top + part.shape[0]], float)
+    return UnexplainedRegion(box, len(rows), (low + high) / 2, high - low)
 
 
-def _margin(scene: ObservedScene) -> Floats:
-    return _MARGIN * _growth(scene)
+def _margin(depth: Float32s) -> Floats:
+    return _MARGIN * _growth(depth)
 
 
-def _growth(scene: ObservedScene) -> Floats:
-    """How much larger a sensor's errors are than at one metre or less, H x W."""
-    return np.maximum(scene.depth.astype(np.float64), 1.0) ** 2
+def _growth(depth: Float32s) -> Floats:
+    """How much larger a sensor's errors are than at one metre or less."""
+    return np.maximum(depth.astype(np.float64), 1.0) ** 2
 
 
 def _edge(scene: ObservedScene) -> int:

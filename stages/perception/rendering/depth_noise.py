@@ -123,20 +123,23 @@ def _shadows(depth: Depth, focal_baseline: float) -> Mask:
 
 def _grazing(depth: Depth, K: Intrinsics, rng: np.random.Generator, limit: float) -> Mask:
     """Misses readings of surfaces seen edge-on: never 10 degrees before ``limit``, always 10 degrees after it."""
-    points = back_project(depth, K)
-    normals = np.cross(_difference(points, 1), _difference(points, 0))
-    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(points, axis=-1)
-    cosine = np.abs(np.einsum("hwi,hwi->hw", normals, points)) / np.maximum(lengths, 1e-12)
+    # Planes of coordinates, not points: these are large images.
+    x, y, z = points = np.ascontiguousarray(np.moveaxis(back_project(depth, K), -1, 0))
+    (ax, ay, az), (bx, by, bz) = _difference(points, 2), _difference(points, 1)
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    lengths = np.sqrt(nx * nx + ny * ny + nz * nz) * np.sqrt(x * x + y * y + z * z)
+    cosine = np.abs(nx * x + ny * y + nz * z) / np.maximum(lengths, 1e-12)
     angle = np.rad2deg(np.arccos(np.clip(cosine, 0.0, 1.0)))
     return rng.random(depth.shape) < (angle - (limit - 10.0)) / 20.0
 
 
 def _difference(points: Floats, axis: int) -> Floats:
-    """To the next or from the previous point, whichever is nearer in depth: edges of objects keep their slope."""
+    """To the next or from the previous point of 3 x H x W, whichever is nearer in depth: edges of objects keep their
+    slope."""
     steps = np.diff(points, axis=axis)
     following = np.concatenate([steps, np.take(steps, [-1], axis)], axis)
     previous = np.concatenate([np.take(steps, [0], axis), steps], axis)
-    return np.where(np.abs(following[..., 2:]) < np.abs(previous[..., 2:]), following, previous)
+    return np.where(np.abs(following[2]) < np.abs(previous[2]), following, previous)
 
 
 def _holes(shape: tuple[int, ...], rng: np.random.Generator, share: float) -> Mask:

@@ -13,6 +13,7 @@ zero. Back faces are culled. Pixel centres have integer coordinates and edges ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -65,12 +66,14 @@ class View:
         """fx, fy, cx, cy, width, height for the kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy, self.width, self.height], np.float32)
 
+    @lru_cache(maxsize=4)  # noqa: B019 (of a value)
     def rays(self) -> Floats:
-        """H x W x 3: directions through the pixel centres with unit depth."""
-        x = (np.arange(self.width, dtype=np.float64) - self.cx) / self.fx
-        y = (np.arange(self.height, dtype=np.float64) - self.cy) / self.fy
-        columns, rows = np.meshgrid(x, y)
-        return np.stack([columns, rows, np.ones((self.height, self.width))], -1)
+        """H x W x 3, read-only: directions through the pixel centres with unit depth."""
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., 0] = (np.arange(self.width, dtype=np.float64) - self.cx) / self.fx
+        rays[..., 1] = ((np.arange(self.height, dtype=np.float64) - self.cy) / self.fy)[:, None]
+        rays.flags.writeable = False
+        return rays
 
     def project(self, points: Floats) -> Floats:
         """Pixel coordinates of points in the camera frame, ... x 3 metres -> ... x 2."""

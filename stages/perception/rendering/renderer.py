@@ -116,7 +116,7 @@ class Renderer:
 
     def depth(self, items: Sequence[Item], camera: Camera) -> NDArray[np.float32]:
         """Metres along the optical axis at pixel centres, H x W; 0 where there is nothing."""
-        return self.instances(items, camera)[1]
+        return self.instances(items, camera)[1] if items else np.zeros((self.height, self.width), np.float32)
 
     def close(self) -> None:
         """Frees what was uploaded; other renderers of the process go on."""

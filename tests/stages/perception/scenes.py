@@ -13,6 +13,7 @@ from stages.geometry.poses import exp_so3, pose
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.scene.catalogue import Catalogue
+from stages.scene.scoring import label_of
 
 CATALOGUE_FILE = Path(__file__).parents[3] / "stages" / "scene" / "catalogue.yaml"
 CATALOGUE = Catalogue.load(CATALOGUE_FILE)
@@ -43,13 +44,15 @@ def upright(label: str, x: float, y: float, yaw: float) -> Floats:
 
 
 def render(placed: dict[str, Floats], *, noise: float = 0.0015, seed: int = 0) -> Rendered:
-    """Depth of objects (label -> T_table_object) on a table with Gaussian noise (metres) and 2 % holes."""
+    """Depth of objects (name -> T_table_object) on a table with Gaussian noise (metres) and 2 % holes."""
     rng = np.random.default_rng(seed)
     T_camera_table = camera()
     blank = np.ones((VIEW.height, VIEW.width), np.float32)
     plane = ObservedScene.of(blank, blank > 0, K, T_camera_table).plane_inverse
     poses = {label: T_camera_table @ T for label, T in placed.items()}
-    layers = {label: inverse_depth(Soup.of(CATALOGUE[label].mesh), T, VIEW) for label, T in poses.items()}
+    layers = {
+        name: inverse_depth(Soup.of(CATALOGUE[label_of(name, CATALOGUE)].mesh), T, VIEW) for name, T in poses.items()
+    }
     nearest = np.maximum.reduce([plane, *layers.values()])
     depth = np.where(nearest > 0, 1 / np.maximum(nearest, 1e-6), 0) + rng.normal(0, noise, nearest.shape)
     depth = np.where((nearest > 0.3) & (rng.random(nearest.shape) > 0.02), depth, 0).astype(np.float32)
