@@ -164,7 +164,8 @@ def end_descendants(mark: str) -> list[str]:
                 _signal(pid, signal.SIGKILL)
             elif pid not in ended:
                 _signal(pid, signal.SIGTERM)
-        ended |= found
+        # Of one that is about to go the command line cannot be read any more.
+        ended = found | ended
         clear = 0 if found else clear + 1
         time.sleep(LOOK_SECONDS)
     return list(ended.values())

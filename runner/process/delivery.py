@@ -1,6 +1,8 @@
 """The publisher's side of every edge: waits where consumers have enough to do, and deals parts to replicas."""
 
+import math
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 
@@ -121,11 +123,9 @@ class Delivery:
         Raises Stopped where the graph ends meanwhile; it is sent then too.
         """
         try:
-            with self._changed:
-                for edge in self._edges:
-                    if edge.route.output == port:
-                        self._wait_for_room(edge, envelope.lineage)
-                        edge.note(envelope.id, envelope.lineage)
+            for edge in self._edges:
+                if edge.route.output == port:
+                    self._take_room(edge, envelope)
         finally:
             self._publish(f"m/{self._stage}/{port}", payload)
         self._to_deal.set()
@@ -173,15 +173,22 @@ class Delivery:
                 for key, deal in dealt:
                     self._publish(key, pack(deal))
 
-    def _wait_for_room(self, edge: Outgoing, lineage: str) -> None:
-        waited = 0.0
-        while not edge.has_room(lineage):
-            if self._stopping():
-                raise Stopped
-            self._changed.wait(POLL_SECONDS)
-            waited += POLL_SECONDS
-            if waited - POLL_SECONDS < PATIENCE_SECONDS <= waited:
+    def _take_room(self, edge: Outgoing, envelope: Envelope) -> None:
+        """Notes a message as sent, as soon as there is room for its lineage."""
+        warn_at = time.monotonic() + PATIENCE_SECONDS
+        while True:
+            with self._changed:
+                if edge.has_room(envelope.lineage):
+                    edge.note(envelope.id, envelope.lineage)
+                    return
+                if self._stopping():
+                    raise Stopped
+                self._changed.wait(POLL_SECONDS)
+                oldest = next(iter(edge.unanswered), "")
+            if time.monotonic() > warn_at:
+                warn_at = math.inf
+                # Without the lock: what is said travels, too.
                 self._warn(
                     f"held back: {edge.route.consumer}.{edge.route.input} has {edge.route.queue} lineages to answer, "
-                    f"the oldest since {next(iter(edge.unanswered), '')}"
+                    f"the oldest since {oldest}"
                 )

@@ -63,7 +63,7 @@ class Redelivery:
         """Causes of the messages, by stage and id, whose step has not come yet."""
         self._recent = Recent[str, None]()
         """Ids of messages that have come lately."""
-        self._early: set[tuple[str, int, str, str]] = set()
+        self._early = Recent[tuple[str, int, str, str], None]()
         """(stage, taker, port, id) done with before it came: its publisher's link is the slower one."""
 
     def note_message(self, topic: str, message: Envelope, payload: bytes) -> Iterator[tuple[str, str]]:
@@ -77,7 +77,7 @@ class Redelivery:
         self._recent[id] = None
         for place, waiting in self._edges.get(topic, {}).items():
             early = (*place, id) in self._early
-            self._early.discard((*place, id))
+            self._early.pop((*place, id), None)
             if early or (known and id not in waiting.messages):
                 yield place[0], place[2]
             elif not known:
@@ -91,7 +91,7 @@ class Redelivery:
             for taker in (step.replica, -1):
                 waiting = self._by_place.get((step.stage, taker, port))
                 if waiting is not None and not waiting.done(id) and id not in self._recent:
-                    self._early.add((step.stage, taker, port, id))
+                    self._early[step.stage, taker, port, id] = None
 
     def sources_of(self, consumer: str) -> set[str]:
         """The stages that a stage gets messages from."""

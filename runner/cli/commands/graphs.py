@@ -8,7 +8,7 @@ import gc
 import json
 from typing import TYPE_CHECKING
 
-from runner.cli.commands import Commands, add, add_graph, add_recordings
+from runner.cli.commands import Commands, add, add_graph, add_recordings, add_settings, graph_file
 from runner.contract import Refused
 from runner.terminal import Terminal
 
@@ -41,7 +41,9 @@ def add_commands(commands: Commands) -> None:
     up.add_argument("--page", action="store_true", help=text)
     add_graph(add(commands, "check", _check, "check a graph file: keys, settings, classes and every edge's type"))
     add_graph(add(commands, "graph", _graph, "print a graph as a Mermaid flow chart"))
-    add(commands, "schema", _schema, "print the JSON Schema of graph files")
+    schema = add(commands, "schema", _schema, "print the JSON Schema of graph files, or of all messages of a graph")
+    schema.add_argument("graph", type=graph_file, nargs="?", metavar="GRAPH", help="whose messages, by STAGE/PORT")
+    add_settings(schema)
 
 
 def _up(options: argparse.Namespace) -> int:
@@ -144,7 +146,15 @@ def _graph(options: argparse.Namespace) -> None:
     print(mermaid(load_graph(options.graph, options.settings)))
 
 
-def _schema(_: argparse.Namespace) -> None:
-    from runner.graph.graph import graph_schema
+def _schema(options: argparse.Namespace) -> None:
+    from runner.graph.graph import graph_schema, load_graph
+    from runner.message.codec import json_schema
 
-    print(json.dumps(graph_schema(), indent=2))
+    if options.graph is None:
+        described = graph_schema()
+    else:
+        stages = load_graph(options.graph, options.settings).nodes.items()
+        described = {
+            f"{stage}/{port}": json_schema(kind) for stage, node in stages for port, kind in node.type.outputs.items()
+        }
+    print(json.dumps(described, indent=2))

@@ -7,6 +7,7 @@ import pytest
 
 from runner.graph.graph import Route
 from runner.message.codec import Envelope, Outcome, Step
+from runner.message.ids import REMEMBERED
 from runner.message.packet import Process
 from runner.process import redelivery
 from runner.process.redelivery import Redelivery
@@ -112,6 +113,14 @@ def test_a_message_that_was_consumed_before_it_came_is_answered_when_it_comes():
     assert recorder.message(0) == ("counter.number#0", [("worker", "input")])
     recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == []
+
+
+def test_only_the_newest_of_what_was_consumed_before_it_came_are_remembered():
+    """Most never come: their publisher and the link to it are gone."""
+    recorder = Recorder()
+    for number in range(REMEMBERED + 1):
+        recorder.step(f"counter.number#{number}")
+    assert [len(recorder.message(number)[1]) for number in (REMEMBERED, 1, 0)] == [1, 1, 0]
 
 
 def test_a_message_that_comes_again_after_it_was_consumed_is_answered():

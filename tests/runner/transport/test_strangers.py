@@ -52,9 +52,13 @@ def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path
 
 
 @contextlib.contextmanager
-def listening(address: str, run: str) -> Iterator[subprocess.Popen[str]]:
-    """The example, in a process of its own."""
-    command = [sys.executable, str(EXAMPLE), address, run]
+def listening(address: str, run: str, graph: Path, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """The example, in a process of its own, with the schemas that ``runner schema`` prints."""
+    schemas = folder / "schemas.json"
+    with schemas.open("w") as file:
+        described = [sys.executable, "-m", "runner.cli", "schema", str(graph), "--set", "sink.path=out"]
+        subprocess.run(described, stdout=file, check=True)
+    command = [sys.executable, str(EXAMPLE), address, run, str(schemas)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "listening\n"
@@ -70,7 +74,11 @@ def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_
     taken.touch()
     process = start(ALBUM, tmp_path, f"listen={address}", f"camera.go={tmp_path / 'go'}", f"camera.taken={taken}")
     before = read_until(process, "processes are ready")
-    with listening(address, run_of(before)) as stopped, stranger(address) as session, taken.open("ab", 0) as heard:
+    with (
+        listening(address, run_of(before), ALBUM, tmp_path) as stopped,
+        stranger(address) as session,
+        taken.open("ab", 0) as heard,
+    ):
         session.declare_subscriber(f"{run_of(before)}/m/camera/*", lambda _: heard.write(b"."))
         os.kill(stopped.pid, signal.SIGSTOP)
         time.sleep(1)
@@ -85,7 +93,7 @@ def test_the_example_shows_what_flows(tmp_path: Path):
     address = public_address()
     process = start(TOYS, tmp_path, f"listen={address}", "counter.count=100000", "counter.period=0.02")
     before = read_until(process, "processes are ready")
-    with listening(address, run_of(before)) as listener:
+    with listening(address, run_of(before), TOYS, tmp_path) as listener:
         assert listener.stdout is not None
         shown = [listener.stdout.readline() for _ in range(50)]
     process.terminate()
@@ -93,6 +101,18 @@ def test_the_example_shows_what_flows(tmp_path: Path):
     assert any(
         re.fullmatch(r"splitter\.piece#\d+ Piece {'index': \d, 'count': 4, 'value': \d+}\n", one) for one in shown
     )
+
+
+def test_the_example_shows_arrays(tmp_path: Path):
+    address = public_address()
+    process = start(ALBUM, tmp_path, f"listen={address}", f"camera.go={tmp_path / 'go'}", "camera.size=3")
+    before = read_until(process, "processes are ready")
+    with listening(address, run_of(before), ALBUM, tmp_path) as listener:
+        (tmp_path / "go").touch()
+        assert listener.stdout is not None
+        first = listener.stdout.readline()
+        finish(process, tmp_path, before)
+    assert first == "camera.picture#0 Picture {'pixels': array([0, 0, 0], dtype=uint8), 'last': False}\n"
 
 
 INTRUDER = """
