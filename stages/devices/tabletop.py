@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stages.geometry.arrays import Floats
+from stages.perception.rendering.rasteriser import Soup, View, inverse_depth
 from stages.robots import Robot
 from stages.scene.catalogue import CatalogueObject
 
@@ -17,6 +18,7 @@ HIDDEN = 0.5
 """Largest share of an object's image rectangle that the rectangle of an object in front may cover."""
 _BORDER = 6.0
 """Pixels."""
+_TRIANGLES = 500
 
 
 def is_seen(robot: Robot, objects: Sequence[tuple[CatalogueObject, Floats]], hidden: float = HIDDEN) -> bool:
@@ -32,6 +34,16 @@ def is_seen(robot: Robot, objects: Sequence[tuple[CatalogueObject, Floats]], hid
     stacked = np.linalg.norm(places[:, None] - places, axis=2) < 0.03
     behind = (high[:, None, 1] < high[None, :, 1]) & ~stacked
     return bool((covered[behind] <= hidden).all())
+
+
+def least_shown(robot: Robot, objects: Sequence[tuple[CatalogueObject, Floats]]) -> float:
+    """The smallest share of an object's silhouette (at its T_base_object) that none of the others hides."""
+    view = View.of(robot.camera.K, *robot.camera.size)
+    layers = [
+        inverse_depth(Soup.of(entry.simplified(_TRIANGLES)), robot.T_camera_base @ T, view) for entry, T in objects
+    ]
+    nearest = np.maximum.reduce(layers)
+    return min(float((layer >= nearest)[layer > 0].mean()) for layer in layers)
 
 
 def is_inside_image(robot: Robot, rectangle: Floats) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
-from stages.devices.tabletop import HIDDEN, Layout
+from stages.devices.tabletop import HIDDEN, Layout, least_shown
 from stages.geometry.arrays import Floats
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue
@@ -60,11 +60,15 @@ class Suite(ABC):
         return ""
 
 
+_SHOWN = 0.05
+"""Share of its silhouette that an object of a goal shows at least: what nobody sees is not shown."""
+
+
 class Drawn(Suite):
     """A suite whose scenes are put together object by object, as a draft; nothing in them is written by hand."""
 
     hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 0.8}
-    """Largest share of an object that others hide from the camera. What nobody sees cannot be shown as a goal."""
+    """Largest share of an object that others in front of it hide from the camera."""
 
     def __init__(self, catalogue: Catalogue, robot: Robot, seed: int) -> None:
         self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
@@ -105,6 +109,9 @@ class Drawn(Suite):
         if stuck(self.robot, draft.placed, draft.supports, self.table) - self.stubborn(kind):
             raise Rejected("out of reach")
         if kind == "goal":
+            items = draft.placed.values()
+            if least_shown(self.robot, [(i.stance.item, i.T_table_object) for i in items]) < _SHOWN:
+                raise Rejected("of an object next to nothing is in sight")
             self._goal = draft
         elif self._goal is not None and all(
             stuck(self.robot, there.placed, there.supports, self.table) for there in self._goal.moved_with(draft)

@@ -27,7 +27,7 @@ _STRAY = 4.0
 """A centre one apparent diameter outside costs so many times what the window costs without the object."""
 _FAR = 10.0
 """Where no surface is, one is taken to be this far away, metres: a renderer's far plane."""
-_SLACK = 0.1
+_SLACK = 0.2
 """Apparent diameters that a detector's box may be off by."""
 
 

@@ -17,8 +17,8 @@ _OPEN = 0.1
 """Share of what stands in a candidate's box from which on its object may be missing, or stand elsewhere."""
 _EQUAL = 0.01
 """Difference of two such shares that is none."""
-_UNSEEN = 0.01
-"""Visible share of an object up to which it explains nothing."""
+_UNSEEN = 0.05
+"""Visible share of an object up to which it may well explain nothing."""
 _MISFIT = 1.5
 """How many times as badly as the others (their median) an object fits from which on its label is doubted."""
 _SAME = 0.5
@@ -40,10 +40,10 @@ class Revision:
 def revisions(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
     """Every revision of the best scene but other labels, the likelier kinds first.
 
-    An object that others hide wholly is left out; an offer comes in; another object of the same kind does, for two of
-    which one hides most of the other may share a box; an offer comes in, and an object in its way is looked for again
-    then; an object is looked for again; it is left out. Where as much was unexplained ``before``, in the scene that the
-    last round revised, that was in vain.
+    An object that others hide all but wholly is left out; an offer comes in; another object of the same kind does, for
+    two of which one hides most of the other may share a box; an offer comes in, and an object in its way is looked for
+    again then; an object is looked for again; it is left out. Where as much was unexplained ``before``, in the scene
+    that the last round revised, that was in vain.
     """
     everything = tuple(range(len(best.objects)))
     chosen = _chosen(best.objects, offers)

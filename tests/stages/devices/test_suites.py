@@ -14,7 +14,7 @@ from stages.devices.simulation import Simulation
 from stages.devices.suites import kinds
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.suites.reach import stuck
-from stages.devices.tabletop import HIDDEN
+from stages.devices.tabletop import HIDDEN, least_shown
 from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.relations import Tolerances, supports
@@ -139,6 +139,21 @@ def test_fallen_objects_lie_at_the_start_only() -> None:
     goal, start, _ = looks("fallen", 0)
     assert (goal.T_base_objects[:, 2, 2] > 0.99).all()
     assert (start.T_base_objects[:, 2, 2] < 0.1).any()
+
+
+def test_of_every_object_of_a_goal_something_is_in_sight() -> None:
+    """Of the can under the sponge of the first draw 1.5 % shows."""
+    goal, _, said = looks("swap", 521)
+    assert "of an object next to nothing is in sight 1" in said
+    seen = [(CATALOGUE[name], T) for name, T in poses(goal).items()]
+    assert least_shown(ROBOT, seen) > 0.05
+    away, over = np.eye(4), np.eye(4)
+    away[:3, 3], over[:3, 3] = (0.75, -0.2, 0.8), (0.75, 0.2, 0.8)
+    below = over.copy()
+    below[2, 3] -= 0.06
+    alone = [(CATALOGUE["tuna_can"], away), (CATALOGUE["cereal_box"], over)]
+    assert least_shown(ROBOT, alone) == 1.0
+    assert least_shown(ROBOT, [*alone, (CATALOGUE["sponge"], below)]) < 0.5
 
 
 def test_what_stands_where_no_hand_fits_is_stuck() -> None:
