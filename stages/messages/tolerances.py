@@ -60,7 +60,8 @@ TOLERANCES = {
     "ObjectPose.visible": SHARE,
     "ObjectPose.probability": Tolerance(0.05),
     "ObjectPose.spread_metres": POSE,
-    "ObjectPose.spread_radians": Tolerance(0.01),
+    # Of a few poses that are polished; on another processor one of them may end elsewhere.
+    "ObjectPose.spread_radians": Tolerance(0.1),
     "ObjectPose.looked_through": SHARE,
     "ObjectPose.facing": PROBABILITY,
     "Alternative.T_camera_object": POSE,
