@@ -65,7 +65,7 @@ TOLERANCES = {
     "ObjectPose.looked_through": SHARE,
     "ObjectPose.facing": PROBABILITY,
     "Alternative.T_camera_object": POSE,
-    "Alternative.probability": PROBABILITY,
+    "Alternative.probability": Tolerance(0.05),
     "UnknownRegion.box": Tolerance(2.0),
     "UnknownRegion.points": Tolerance(20.0),
     "UnknownRegion.centre_table": POSE,
