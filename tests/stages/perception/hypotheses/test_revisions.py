@@ -6,20 +6,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.messages import Candidate, ObjectPose, Posterior
 from stages.messages.digest import Contender, Offer
 from stages.perception.hypotheses.revisions import Revision, combined, equalled
 
 LEFT, RIGHT = np.array([0.0, 0, 40, 60]), np.array([100.0, 0, 140, 60])
-OFFERS = tuple(
-    Offer(candidate=Candidate(label=label, box=box, confidence=0.3), share=0.1, instead=instead)
-    for label, box, instead in (
-        ("salt_shaker", LEFT, False),
-        ("soup_can", LEFT, True),
-        ("cup", RIGHT, False),
-        ("mug", RIGHT, True),
+
+
+def offered(*each: tuple[str, Floats, bool]) -> tuple[Offer, ...]:
+    """Offers by label and box, and whether they are another label of a box."""
+    return tuple(
+        Offer(candidate=Candidate(label=label, box=box, confidence=0.3), share=0.1, instead=instead)
+        for label, box, instead in each
     )
-)
+
+
+OFFERS = offered(("salt_shaker", LEFT, False), ("soup_can", LEFT, True), ("cup", RIGHT, False), ("mug", RIGHT, True))
 SHAKER, CAN, CUP, MUG = range(4)
 
 
@@ -73,16 +76,13 @@ def test_the_first_round_revises_nothing():
 
 def test_what_stands_in_the_box_of_another_object_may_be_an_equal_of_it():
     stack, front = np.array([0.0, 0, 60, 80]), np.array([10.0, 60, 50, 80])
-    offers = tuple(
-        Offer(candidate=Candidate(label=label, box=box, confidence=0.9), share=0.1, instead=instead)
-        for label, box, instead in (
-            ("sponge", stack, False),
-            ("tuna_can", front, False),
-            ("sponge", front, True),
-            ("mug", front, True),
-            ("cup", RIGHT, False),
-            ("sponge", RIGHT, True),
-        )
+    offers = offered(
+        ("sponge", stack, False),
+        ("tuna_can", front, False),
+        ("sponge", front, True),
+        ("mug", front, True),
+        ("cup", RIGHT, False),
+        ("sponge", RIGHT, True),
     )
     assert equalled(posterior(0, -90.0, 0, 1, 4, offers=offers), offers) == [Revision((0, 2), (2,))]
     assert equalled(posterior(0, -90.0, 0, 2, 4, offers=offers), offers) == []
