@@ -419,6 +419,30 @@ def test_what_slides_down_in_the_hand_is_put_down_all_the_same(destination: str,
         np.testing.assert_allclose(T[:3, 3], expected[:3, 3], atol=0.01)
 
 
+def test_what_turns_in_the_hand_and_spreads_the_fingers_goes_back() -> None:
+    """As it is held from then on: what made the arm stop does not bar the way back."""
+    bench, began = Bench(0, "tea"), list[float]()
+    before, target = bench.poses(), bench.poses()["tea_box"]
+    target[1, 3] += 0.12
+
+    def turn(label: str) -> None:
+        if label == "carry tea_box":
+            began.append(bench.simulation.time)
+            if began[-1] > began[0] + 0.7 and bench.simulation.servo.opening() < 0.07:
+                bench.simulation.place("tea_box", turned(bench.simulation.layout()["tea_box"]), settle=0.0)
+
+    def turned(T: Floats) -> Floats:
+        """By 45 degrees about the hand, the 2 mm from which an object is dropped taken off."""
+        hand, R = bench.simulation.hand(), exp_so3(np.array([0.0, 0.0, np.pi / 4]))
+        return np.block([[R @ T[:3, :3], (hand + R @ (T[:3, 3] - hand) - [0, 0, 0.002])[:, None]], [T[3:]]])
+
+    bench.meddle = turn
+    outcome = bench.transfer(before, "tea_box", "table", target)
+    assert (outcome.success, outcome.failed_stage, outcome.held) == (False, "slip", "") and bench.is_home()
+    assert outcome.reason.startswith("the fingers are 74 mm apart")
+    assert np.linalg.norm(bench.poses()["tea_box"][:3, 3] - before["tea_box"][:3, 3]) < 0.02
+
+
 def test_what_is_not_quite_where_it_was_seen_is_grasped_beside_that() -> None:
     bench = Bench(0, "tea")
     seen, target = bench.poses(), bench.poses()["cup"]

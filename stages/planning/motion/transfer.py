@@ -192,7 +192,7 @@ class TransferRoutine:
         if self.in_hand:
             state = yield from self._do("feel what is in the hand", width=0.0)
             if state.gripper_width > self._robot.gripper.closed_width + _EMPTY:
-                return (yield from self._put_back(at, q))
+                return (yield from self._put_back(at, state))
         yield from self._do("open the hand", width=self._robot.gripper.open_width)
         self.in_hand = ""
         distance, back = _back(at.plan.pick.approach, q)
@@ -201,13 +201,14 @@ class TransferRoutine:
             q = back[-1]
         return (yield from self._home(at.world, q, rise=rise))
 
-    def _put_back(self, at: _UnderWay, q: Floats) -> Steps:
-        """What is held returns the way it came to where it was taken from: both are free and within reach."""
-        pick, carried = at.plan.pick, at.world.carried
+    def _put_back(self, at: _UnderWay, state: RobotState) -> Steps:
+        """What is held, as it is held now, returns the way it came to where it was taken from: both are free and
+        within reach."""
+        pick, carried, q = at.plan.pick, at.world.carried, self._arm(state)
         distance, lower = _back(pick.lift, q)
         if distance > _AWAY:
             way = densify(np.vstack([at.plan.carry, at.plan.place.lower]), _RETRACED)
-            narrowest, widest = self._held_between(pick.hand.grasp)
+            narrowest, widest = self._held_between(state.gripper_width)
             guard = Guard(narrowest=narrowest, widest=widest, force=_RUB + self._weight)
             yield from self._do(f"carry {carried} back", _back(way, q)[1], speed=_SLOW, guard=guard)
             lower = pick.lift[::-1]
@@ -255,7 +256,7 @@ class TransferRoutine:
             return (yield from self._back_off(world, plan, state))
         self.in_hand = world.carried
         self._log(f"{world.carried}: grasped with {grasp.name!r}, {1e3 * state.gripper_width:.0f} mm wide")
-        narrowest, widest = self._held_between(grasp)
+        narrowest, widest = self._held_between(grasp.width)
         holding = Guard(narrowest=narrowest, widest=widest)
         lifting = replace(holding, load=_BORNE * self._weight)
         try:
@@ -340,7 +341,7 @@ class TransferRoutine:
         """A touch less than ``early`` metres above the target is the support."""
         world, felt, slid = at.world, False, 0.0
         deeper = straight_motion(world, place.lower[-1], raised(place.hand.T_base_hand, _LOWEST), free=False)
-        narrowest, _ = self._held_between(place.hand.grasp)
+        narrowest, _ = self._held_between(place.hand.grasp.width)
         feeling = Guard(narrowest=narrowest, force=_TOUCH, error=_YIELDS)
         try:
             state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
@@ -425,13 +426,13 @@ class TransferRoutine:
 
     def _is_held(self, state: RobotState, grasp: Grasp) -> bool:
         """The fingers stalled near the width at which they touch the object."""
-        narrowest, widest = self._held_between(grasp)
+        narrowest, widest = self._held_between(grasp.width)
         return narrowest < state.gripper_width < widest
 
-    def _held_between(self, grasp: Grasp) -> tuple[float, float]:
-        """Metres between the fingers while they hold the object, at least and at most."""
+    def _held_between(self, width: float) -> tuple[float, float]:
+        """Metres between the fingers while they hold what is that wide, at least and at most."""
         shut = self._robot.gripper.closed_width
-        return shut + 0.5 * (grasp.width - shut), grasp.width + _WIDER
+        return shut + 0.5 * (width - shut), width + _WIDER
 
     def _arm(self, state: RobotState) -> Floats:
         return arm(self._robot, state)
