@@ -146,3 +146,21 @@ def test_what_hangs_above_what_is_said_to_carry_it_is_named(carrier: str, lift: 
     graph = layout.graph()
     standing = [Standing.at(name, stances(name), T) for name, T in layout.poses.items()]
     assert gaps(standing, graph.assertions, Tolerances()) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(("x", "y"), [(-0.165, 0.0), (0.0, -0.1), (-0.165, -0.1)])
+def test_what_overhangs_one_side_of_a_tray_hangs_above_its_floor(x: float, y: float):
+    """The rim of one side, or of a corner, would not bear it: there must be something below."""
+    layout = Layout().put("tray", 0, 0).put("sponge", x, y, on="tray")
+    layout.poses["sponge"][2, 3] += 0.04
+    standing = [Standing.at(name, stances(name), T) for name, T in layout.poses.items()]
+    assert gaps(standing, layout.graph().assertions, Tolerances()) == pytest.approx({"sponge": 0.04}, abs=2e-3)
+
+
+@pytest.mark.parametrize("upper", ["plate", "tray"])
+def test_what_lies_on_the_rim_all_round_does_not_hang(upper: str):
+    layout = Layout().put("bowl", 0, 0).put(upper, 0, 0, on="bowl")
+    standing = [Standing.at(name, stances(name), T) for name, T in layout.poses.items()]
+    layout.poses[upper][2, 3] += standing[0].z_top - standing[1].z_bottom
+    standing = [Standing.at(name, stances(name), T) for name, T in layout.poses.items()]
+    assert gaps(standing, layout.graph().assertions, Tolerances()) == {}
