@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.testing import finish, read_until, start_graph
 from stages.messages import Frame, LookRequest, RobotCommand, RobotState, Ros2Heard, Ros2Sent
 from tests.runner.common.waiting import wait_until

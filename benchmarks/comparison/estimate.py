@@ -16,7 +16,8 @@ from benchmarks.common.datasets import Image, ImageId, detections_file, images, 
 from benchmarks.common.pipeline import Done, Estimate, Part, Pipeline, answered, constructed_filter
 from benchmarks.comparison.accuracy import failures, right_sets, score, table
 from runner.contract import Refused
-from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph
+from runner.graph.graph import Graph, graph_to_json
+from runner.graph.reading import graph_from_json, load_graph
 from runner.process.children import ENVIRONMENT
 from stages.devices.bop_results import HEADER, Result
 from stages.particle_filter import ParticleFilter

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.robot.acting import carried_out
 from benchmarks.robot.looks import ROOT, Perception
 from runner.contract import Message
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from stages.camera import SimulatedCamera
 from stages.corrector import Corrector, told
 from stages.devices.suites import kinds

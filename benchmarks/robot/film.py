@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from runner.contract import Message
-from runner.graph.graph import graph_from_json
+from runner.graph.reading import graph_from_json
 from runner.recording.recording import Recording, opened
 from stages.devices.simulated_camera import SimulatedCamera
 from stages.estimate import Quiet

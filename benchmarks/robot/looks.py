@@ -20,7 +20,8 @@ import msgspec
 import numpy as np
 
 from benchmarks.robot.suites import looks
-from runner.graph.graph import Graph, load_graph
+from runner.graph.graph import Graph
+from runner.graph.reading import load_graph
 from stages.devices.suites import kinds
 from stages.estimate import FiltersHere, Quiet, SceneEstimator
 from stages.geometry.arrays import Floats

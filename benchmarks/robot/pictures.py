@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
-from runner.graph.graph import graph_from_json
+from runner.graph.reading import graph_from_json
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from stages.messages import Frame

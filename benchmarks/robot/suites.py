@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.testing import run_stage
 from stages.camera import SimulatedCamera
 from stages.devices.suites import kinds

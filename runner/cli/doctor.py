@@ -19,7 +19,9 @@ from typing import Literal
 import psutil
 
 from runner.contract import Refused, Stage
-from runner.graph.graph import Node, load_class, load_graph
+from runner.graph.graph import Node
+from runner.graph.reading import load_graph
+from runner.graph.references import load_class
 from runner.inspect.info import byte_count
 from runner.live.tables import from_here
 from runner.transport.bus import Bus

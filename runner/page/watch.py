@@ -17,7 +17,8 @@ from pathlib import Path
 from mcap.records import Metadata
 
 from runner.contract import Message
-from runner.graph.graph import Graph, graph_from_json
+from runner.graph.graph import Graph
+from runner.graph.reading import graph_from_json
 from runner.message.codec import CodecError, Envelope, LogLine, open_envelope, unpack
 from runner.page.story import Doing, Heard, Language, Story, Told, load_story
 from runner.recording.container import POLL_SECONDS, Container, Entry, Growing, open_file

@@ -1,10 +1,7 @@
 """Puts messages together to steps: joins and gathers by lineage, whatever the order of arrival."""
 
-import contextlib
-import queue
-import threading
 from collections import OrderedDict, deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import cast
 
 import msgspec
@@ -12,86 +9,7 @@ import msgspec
 from runner.contract import Part
 from runner.graph.graph import Node
 from runner.graph.ports import Handler, InputPort
-from runner.message.packet import Packet
 from runner.process.step import Arrival
-
-
-class Mailbox:
-    """What has arrived and is not decoded, in order of arrival; of a port of policy ``latest`` only the newest."""
-
-    def __init__(self, node: Node):
-        self._latest = {port for port, edge in node.inputs.items() if edge.policy == "latest"}
-        self._queue: queue.SimpleQueue[tuple[str, Packet | None]] = queue.SimpleQueue()
-        self._newest: dict[str, Packet] = {}
-        self._exchanging = threading.Lock()
-
-    def put(self, port: str, packet: Packet) -> None:
-        """Takes a packet, from any thread."""
-        if port not in self._latest:
-            self._queue.put((port, packet))
-            return
-        with self._exchanging:
-            if port not in self._newest:
-                self._queue.put((port, None))
-            self._newest[port] = packet
-
-    def wake(self) -> None:
-        """Ends a wait. May be called from any thread and from a signal handler."""
-        self._queue.put(("", None))
-
-    def take(self, *, wait: bool) -> Iterator[tuple[str, Packet]]:
-        """Every (port, packet) that is there; waits for one where there is none, or until it is woken."""
-        with contextlib.suppress(queue.Empty):
-            port, packet = self._queue.get(block=wait)
-            while True:
-                if port:
-                    with self._exchanging:
-                        fetched = packet or self._newest.pop(port)
-                    yield port, fetched
-                port, packet = self._queue.get_nowait()
-
-    def __len__(self) -> int:
-        """How many packets wait. May be asked from any thread."""
-        return self._queue.qsize()
-
-
-class Parts:
-    """Parts that are there for all replicas of a stage, each of which works on those that it is dealt."""
-
-    def __init__(self) -> None:
-        self._there: dict[tuple[str, str], Packet] = {}
-        """By (port, id); whose they are is not known yet."""
-        self._dealt: set[tuple[str, str]] = set()
-        """Those of this replica that are still to come."""
-        self._changing = threading.Lock()
-
-    def came(self, port: str, id: str, packet: Packet) -> Packet | None:
-        """Takes a part; returns it where it is this replica's."""
-        with self._changing:
-            if (port, id) in self._dealt:
-                self._dealt.discard((port, id))
-                return packet
-            self._there[port, id] = packet
-            return None
-
-    def deal(self, port: str, id: str) -> Packet | None:
-        """Takes note that a part is this replica's; returns it where it is there."""
-        with self._changing:
-            packet = self._there.pop((port, id), None)
-            if packet is None:
-                self._dealt.add((port, id))
-            return packet
-
-    def forget(self, done: Iterable[tuple[str, str]]) -> None:
-        """Lets go of (port, id) that a replica has done with."""
-        with self._changing:
-            for key in done:
-                self._there.pop(key, None)
-                self._dealt.discard(key)
-
-    def left(self) -> list[tuple[str, str]]:
-        """(port, id) of what nobody has been heard to work on."""
-        return list(self._there)
 
 
 class Mismatched(Exception):

@@ -16,21 +16,23 @@ from typing import Any
 import msgspec
 
 from runner.contract import EXIT_REFUSED, Refused
-from runner.graph.graph import Route, node_from_entry
+from runner.graph.graph import Route
 from runner.graph.placement import Network
 from runner.graph.ports import Handler
+from runner.graph.reading import node_from_entry
 from runner.message import codec
-from runner.message.codec import CodecError, Deal, Draft, Envelope, Journal, Lost, Outcome, Step, answered
-from runner.message.ids import MessageId, Recent
+from runner.message.codec import Deal, Draft, Journal, Lost, Outcome, Step, answered
+from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, prefer_for_oom_kill, print_where_it_crashes
 from runner.process.delivery import Delivery, Stopped
 from runner.process.forks import EXIT_FAILED
 from runner.process.health import Heartbeat
-from runner.process.inbox import Inbox, Mailbox, Mismatched, Parts, Ready
+from runner.process.inbox import Ready
+from runner.process.intake import Intake
 from runner.process.past import bring_back, past_of
-from runner.process.step import Executor, receive, step_time
+from runner.process.step import Executor, step_time
 from runner.recording.recording import Recording
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
@@ -98,7 +100,8 @@ class StageProcess:
             stopping=self._stopping.is_set,
             undone=task.undone,
         )
-        self._inbox = Inbox(self._node)
+        self._refusals = Refusals(partial(self._bus.log, level="error"))
+        self._intake = Intake(self._node, self._refusals, consumed=task.consumed, is_new=task.incarnation == 0)
         self._executor = Executor(
             self._node,
             self._stage,
@@ -107,18 +110,6 @@ class StageProcess:
             log=self._bus.log,
             numbers=task.numbers,
         )
-        self._arrived = Recent[tuple[str, str], None]()
-        """(port, id) of what has arrived, so that it is worked on once."""
-        self._arrived.update(dict.fromkeys(one for one in task.consumed if not self._node.keeps(one[0])))
-        self._left: list[tuple[str, str]] = []
-        """(port, id) of what was refused since the last step."""
-        self._refusals = Refusals(partial(self._bus.log, level="error"))
-        self._mailbox = Mailbox(self._node)
-        self._catching_up = threading.Lock()
-        self._early: list[tuple[str, Packet]] | None = [] if task.incarnation else None
-        """What has come before the recorder has sent again what is older; None once it has."""
-        self._parts = Parts()
-        self._shared = {port for port in self._node.inputs if self._node.shares(port)}
         self._steps = 0
         self._recorded = threading.Condition()
         self._recorded_steps = 0
@@ -135,7 +126,7 @@ class StageProcess:
         expected = {*self._task.processes, (RECORDER, 0), (GATEWAY, 0)}
         gc.freeze()  # what set-up has made stays: no collection need look at it again
         if self._presence.wait_for(expected, self._stopping.is_set):
-            while self._early is not None and not self._stopping.is_set():
+            while self._intake.is_behind and not self._stopping.is_set():
                 time.sleep(CATCH_UP_SECONDS)
             self._start()
             self._serve()
@@ -143,14 +134,14 @@ class StageProcess:
     def stop(self) -> None:
         """Ends :meth:`run` after the present step. May be called from a signal handler."""
         self._stopping.set()
-        self._mailbox.wake()
+        self._intake.wake()
 
     def retire(self) -> None:
         """Ends :meth:`run` after the whole present step; a successor does the rest. May be called from a signal
         handler.
         """
         self._retiring.set()
-        self._mailbox.wake()
+        self._intake.wake()
 
     def close(self, *, failed: bool = False) -> None:
         """Journals the end, unless the process has ``failed``, and releases the stage and the bus."""
@@ -171,10 +162,10 @@ class StageProcess:
             self._bus.subscribe(f"j/{consumer}", self._refusals.reading(Journal, self._on_journal))
         for port, edge in self._node.inputs.items():
             listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
-            listen(f"m/{edge.stage}/{edge.port}", partial(self._on_message, port))
-        self._bus.hand_over(f"again/{own}/*", lambda packet: self._arrive(packet.end, packet))
-        self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._on_ready())
-        self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._on_deal))
+            listen(f"m/{edge.stage}/{edge.port}", partial(self._intake.came, port))
+        self._bus.hand_over(f"again/{own}/*", lambda packet: self._intake.came_again(packet.end, packet))
+        self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._intake.caught_up())
+        self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._intake.deal))
         self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
@@ -188,7 +179,7 @@ class StageProcess:
             **(record.vitals() if record is not None else {}),
             "steps": self._steps,
             "refused": self._refusals.count,
-            "queued": {**self._inbox.waiting, "mailbox": len(self._mailbox)},
+            "queued": self._intake.waiting,
             "sent": dict(self._sent),
         }
 
@@ -213,61 +204,12 @@ class StageProcess:
         for done in (journal.answered, *map(answered, journal.steps)):
             self._delivery.answered(consumer, done)
             if consumer == self._process.stage:
-                self._parts.forget(done)
+                self._intake.forget(done)
         own = [step for step in journal.steps if step.process == self._process]
         if own:
             with self._recorded:
                 self._recorded_steps = own[-1].number + 1
                 self._recorded.notify_all()
-
-    def _on_message(self, port: str, packet: Packet) -> None:
-        with self._catching_up:
-            if self._early is not None:
-                self._early.append((port, packet))
-                return
-        self._arrive(port, packet)
-
-    def _on_ready(self) -> None:
-        """What is older than all that came directly has been sent again by now."""
-        with self._catching_up:
-            for port, packet in self._early or ():
-                self._arrive(port, packet)
-            self._early = None
-
-    def _arrive(self, port: str, packet: Packet) -> None:
-        """Hands what has come to the thread that runs steps; of parts only its own."""
-        if port in self._shared:
-            try:
-                found = self._parts.came(port, codec.unpack(Envelope, packet.payload).id, packet)
-            except CodecError:
-                found = packet  # and who takes it says what is wrong with it
-            if found is None:
-                return
-        self._mailbox.put(port, packet)
-
-    def _on_deal(self, deal: Deal, packet: Packet) -> None:
-        if (part := self._parts.deal(packet.end, deal.id)) is not None:
-            self._mailbox.put(packet.end, part)
-
-    def _take(self, name: str, packet: Packet) -> None:
-        """Decodes one message into the inbox, unless it has been here before."""
-        id = ""
-        try:
-            envelope = codec.unpack(Envelope, packet.payload)
-            id = envelope.id
-            if (name, id) in self._arrived:
-                return
-            port = self._node.type.inputs.get(name)
-            if port is None:
-                raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
-            travelled = packet.arrived_ns - packet.sent_ns if packet.sent_ns else 0
-            self._inbox.add(receive(port, envelope, arrived_ns=packet.arrived_ns, travelled_ns=travelled))
-        except (CodecError, Mismatched) as error:
-            self._refusals.refuse(packet.key, error)
-            if id:
-                self._left.append((name, id))
-        if id:
-            self._arrived[name, id] = None
 
     # ------------------------------------------------------------------------------------------ steps
 
@@ -280,17 +222,12 @@ class StageProcess:
         """Works off inputs as they come; a source is advanced in between."""
         source = None if self._node.type.source is None else self._advance(self._node.type.source)
         while not (self._stopping.is_set() or self._retiring.is_set()):
-            self._take_all(wait=source is None)
-            ready = self._inbox.pop()
+            self._intake.take(wait=source is None)
+            ready = self._intake.inbox.pop()
             if ready is not None:
                 self._step(ready)
             if source is not None and not next(source, False):
                 source = None
-
-    def _take_all(self, *, wait: bool) -> None:
-        """Takes every packet that is there; waits for one if there is nothing else to do."""
-        for port, packet in self._mailbox.take(wait=wait and not self._inbox.has_ready):
-            self._take(port, packet)
 
     def _step(self, ready: Ready) -> None:
         """Runs one handler to its end and journals it."""
@@ -322,9 +259,9 @@ class StageProcess:
 
     def _let_others_in(self) -> None:
         """Runs the steps of other handlers, before one that has yielded None goes on."""
-        self._take_all(wait=False)
+        self._intake.take(wait=False)
         while not self._stopping.is_set():
-            ready = self._inbox.pop(self._busy)
+            ready = self._intake.inbox.pop(self._busy)
             if ready is None:
                 return
             self._step(ready)
@@ -364,8 +301,7 @@ class StageProcess:
         self._delivery.publish(port, envelope, payload)
 
     def _journal(self, record: "_Record") -> None:
-        left, self._left = (*self._left, *self._inbox.take_unused()), []
-        self._publish_step(record.step(self._process, self._steps, left))
+        self._publish_step(record.step(self._process, self._steps, self._intake.take_left()))
 
     def _publish_step(self, step: Step) -> None:
         self._steps += 1
@@ -377,16 +313,16 @@ class StageProcess:
         if not self._retiring.is_set():
             self._bus.publish(f"e/{self._process.path}", b"")
             self._presence.wait_for_the_end({edge.stage for edge in self._node.inputs.values()}, self._task.processes)
-            self._take_all(wait=False)
+            self._intake.take(wait=False)
             self._say_what_is_left()
-            left = (*self._inbox.left(), *self._parts.left())
-        left = (*self._left, *self._inbox.take_unused(), *left)
+            left = self._intake.left()
+        left = (*self._intake.take_left(), *left)
         end = Step(*self._process, self._steps, "", (), (), time.time_ns(), 0, 0, 0, outcome="ended", left=left)
         self._publish_step(end)
 
     def _say_what_is_left(self) -> None:
         """Records what was never worked on."""
-        for handler, lineage, lacking in self._inbox.incomplete():
+        for handler, lineage, lacking in self._intake.inbox.incomplete():
             self._bus.log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
 
 

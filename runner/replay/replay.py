@@ -22,7 +22,8 @@ import msgspec
 
 from runner.contract import Refused, Tolerance, Tolerances
 from runner.graph.document import Document, suggest
-from runner.graph.graph import Graph, Node, graph_from_json, graph_to_json, node_from_entry
+from runner.graph.graph import Graph, Node, graph_to_json
+from runner.graph.reading import graph_from_json, node_from_entry
 from runner.graph.references import load_class, load_tolerances
 from runner.inspect.info import seconds, table
 from runner.inspect.summary import Summary

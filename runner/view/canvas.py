@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.graph.graph import graph_from_json
+from runner.graph.reading import graph_from_json
 from runner.message.codec import Envelope
 from runner.view import drawing as d
 from runner.view.views import drawn, load_views

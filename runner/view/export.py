@@ -19,7 +19,8 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from runner.graph.graph import Graph, graph_from_json
+from runner.graph.graph import Graph
+from runner.graph.reading import graph_from_json
 from runner.message.codec import LogLine
 from runner.recording.container import new_file
 from runner.recording.recording import Recording

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import msgspec
 
 from runner.contract import Message, Refused
-from runner.graph.graph import Graph, graph_from_json
+from runner.graph.graph import Graph
+from runner.graph.reading import graph_from_json
 from runner.recording.recording import Recording, opened
 from runner.view.views import load_views, require
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runner.contract import Context, Message, Refused, Stage
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.message.codec import CodecError, decode
 from runner.process.step import BrokenContract, step_seed
 from runner.recording.recording import Recording

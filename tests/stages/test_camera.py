@@ -8,8 +8,8 @@ import pytest
 
 import stages.scene
 from runner.contract import Refused
-from runner.graph.graph import load_graph
 from runner.graph.ports import inspect_stage
+from runner.graph.reading import load_graph
 from runner.message import codec
 from runner.recording.writer import RecordingWriter
 from runner.testing import run_stage

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 
 ROOT = Path(__file__).parents[2]
 NEEDED = {

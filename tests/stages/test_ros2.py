@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from runner.testing import run_stage

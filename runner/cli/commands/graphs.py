@@ -82,7 +82,8 @@ def _armed(document: Document) -> list[str]:
 
 def _supervise(options: argparse.Namespace, terminal: Terminal) -> End:
     """Imports all that the graph's processes need, then forks what they are forked from, and only then begins."""
-    from runner.graph.graph import SUPERVISOR, load_graph
+    from runner.graph.graph import SUPERVISOR
+    from runner.graph.reading import load_graph
     from runner.page.start import page_beside, require_page
     from runner.process.fork_server import ForkServer
     from runner.supervise.supervisor import Supervisor
@@ -127,7 +128,7 @@ def _take_part(options: argparse.Namespace, document: Document, host: str, termi
 
 
 def _check(options: argparse.Namespace) -> None:
-    from runner.graph.graph import load_graph
+    from runner.graph.reading import load_graph
     from runner.graph.references import load_class
 
     graph = load_graph(options.graph, options.settings)
@@ -141,13 +142,14 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _graph(options: argparse.Namespace) -> None:
-    from runner.graph.graph import load_graph, mermaid
+    from runner.graph.graph import mermaid
+    from runner.graph.reading import load_graph
 
     print(mermaid(load_graph(options.graph, options.settings)))
 
 
 def _schema(options: argparse.Namespace) -> None:
-    from runner.graph.graph import graph_schema, load_graph
+    from runner.graph.reading import graph_schema, load_graph
     from runner.message.codec import json_schema
 
     if options.graph is None:

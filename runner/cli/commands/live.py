@@ -184,7 +184,7 @@ def _restart(options: argparse.Namespace) -> None:
 
 def _goals(options: argparse.Namespace) -> int | None:
     from runner.graph.document import suggest
-    from runner.graph.graph import load_graph
+    from runner.graph.reading import load_graph
     from runner.page.watch import told_so_far, told_without_a_run
     from runner.supervise.registry import find_run
 

@@ -7,7 +7,7 @@ import yaml
 
 from benchmarks.robot.episodes import Episode
 from benchmarks.robot.paper.__main__ import EXPERIMENTS, Experiment, failures, table, with_features
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from stages.devices.suites.tray import GOALS
 from stages.messages import Assertion
 from stages.scene.truth import Judgement

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.robot.ros2_lab.camera import FRAME
 from benchmarks.robot.ros2_lab.controllers import ARM, FINGER, FOLLOW, GRIP, GRIPPER
 from benchmarks.robot.ros2_lab.wire import Interfaces
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from stages.devices.ros2.settings import Frames
 from stages.devices.ros2.types import Types
 

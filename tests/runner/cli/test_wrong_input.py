@@ -8,8 +8,8 @@ import pytest
 
 from runner.cli.main import main
 from runner.contract import Refused, Stage
-from runner.graph.graph import load_graph
 from runner.graph.placement import Host
+from runner.graph.reading import load_graph
 from runner.hosts.keys import make_keys
 from runner.live.tables import commands_text
 from runner.supervise.calls import CommandType

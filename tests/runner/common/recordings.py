@@ -10,7 +10,8 @@ import msgspec
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.graph.graph import SUPERVISOR, Graph, graph_to_json, load_graph
+from runner.graph.graph import SUPERVISOR, Graph, graph_to_json
+from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, LogLine, Lost, Step, pack
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Ready

@@ -10,7 +10,8 @@ import yaml
 
 from runner.cli.main import main
 from runner.contract import Refused, Stage
-from runner.graph.graph import Graph, graph_from_json, graph_schema, graph_to_json, load_graph, mermaid
+from runner.graph.graph import Graph, graph_to_json, mermaid
+from runner.graph.reading import graph_from_json, graph_schema, load_graph
 from tests.runner.common.runs import ACCOUNT, TOYS
 from tests.runner.common.toys import Add, Answer, Collect, Number, Piece
 

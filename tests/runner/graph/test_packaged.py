@@ -9,8 +9,9 @@ import pytest
 
 from runner.cli.main import main
 from runner.contract import Refused
-from runner.graph.graph import graph_from_json, graph_to_json, load_graph, node_from_entry
+from runner.graph.graph import graph_to_json
 from runner.graph.packaged import find_graph, locate, portable_name
+from runner.graph.reading import graph_from_json, load_graph, node_from_entry
 from runner.hosts.head import moved
 from runner.recording.provenance import file_hashes, portable
 from runner.testing import finish, runner

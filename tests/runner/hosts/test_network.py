@@ -14,8 +14,9 @@ import zenoh
 
 from runner.contract import Refused
 from runner.graph.document import Document, read_document
-from runner.graph.graph import Graph, graph_from_json, graph_to_json, load_graph, node_entry, node_from_entry
+from runner.graph.graph import Graph, graph_to_json, node_entry
 from runner.graph.placement import Host, Layout, read_layout, read_owners
+from runner.graph.reading import graph_from_json, load_graph, node_from_entry
 from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, RemoteChild, differences, moved
 from runner.message.packet import Process
 from runner.process.children import spawn

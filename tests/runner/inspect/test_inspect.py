@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from runner.cli.main import main
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.inspect.causes import Causes
 from runner.inspect.info import Durations, StageTimes
 from runner.inspect.latency import critical_paths, latency

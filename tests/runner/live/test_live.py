@@ -22,7 +22,8 @@ import pytest
 from runner.cli.completion import Shell, script
 from runner.cli.doctor import examine, examine_graph
 from runner.contract import Refused
-from runner.graph.graph import QUEUE, load_graph
+from runner.graph.graph import QUEUE
+from runner.graph.reading import load_graph
 from runner.inspect.echo import lines_of
 from runner.live.live import Live
 from runner.live.tables import show_progress

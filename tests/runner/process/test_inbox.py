@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from runner.contract import Message
-from runner.graph.graph import Node, load_graph
+from runner.graph.graph import Node
+from runner.graph.reading import load_graph
 from runner.message import codec
 from runner.process.inbox import Inbox, Mismatched
 from runner.process.step import Arrival, receive

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from runner.contract import Refused, Restarted
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, LogLine, Lost, Step, envelope, unpack
 from runner.recording import proof as proof_module
 from runner.recording.proof import Proof, in_short

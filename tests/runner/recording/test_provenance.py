@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.graph.graph import NUMERICAL, graph_to_json, load_graph
+from runner.graph.graph import NUMERICAL, graph_to_json
+from runner.graph.reading import load_graph
 from runner.recording import provenance
 from runner.recording.provenance import DISTRIBUTION, FIRST_NUMERICAL, fingerprint, numerical, revision, runner_version
 from runner.recording.recording import Recording

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.inspect.info import describe
 from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelope
 from runner.recording import writer as writer_module

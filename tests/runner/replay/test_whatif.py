@@ -10,7 +10,7 @@ import pytest
 
 from runner.cli.main import main
 from runner.contract import Message
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.message.codec import decode
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording

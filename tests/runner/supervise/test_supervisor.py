@@ -6,8 +6,8 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from runner.contract import Restarted
-from runner.graph.graph import load_graph
 from runner.graph.ports import port_name
+from runner.graph.reading import load_graph
 from runner.supervise.supervisor import Supervisor
 from runner.terminal import Terminal
 from tests.runner.common.runs import TOYS

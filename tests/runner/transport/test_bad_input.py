@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from runner.graph.graph import Route, load_graph, node_entry
+from runner.graph.graph import Route, node_entry
+from runner.graph.reading import load_graph
 from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Pulse, Step, envelope, pack, unpack
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals

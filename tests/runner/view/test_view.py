@@ -12,7 +12,7 @@ import rerun as rr
 from PIL import Image
 
 from runner.contract import Refused
-from runner.graph.graph import load_graph
+from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, envelope
 from runner.page.viewer import drawn
 from runner.recording.recording import Recording
