@@ -146,17 +146,20 @@ class ParticleFilter(Stage):
     def _charges(
         self, scene: ObservedScene, hypothesis: Hypothesis, objects: Sequence[ObjectPose], tracks: Sequence[Track]
     ) -> tuple[float, ...]:
-        """What the objects that were looked for among the others cost by being there; where one must be, no more than
-        those did in whose place it comes."""
+        """What the objects that were looked for among the others cost by being there: where one must be, no more than
+        those did in whose place it comes; where it cannot be, all that it claims."""
         first = len(hypothesis.charges)
         before = hypothesis.incumbent_charged - hypothesis.charged
+        charges: list[float] = []
         new = zip(hypothesis.candidates[first:], tracks[first:], hypothesis.shares, strict=False)
-        return tuple(
-            before
-            if self._suggestions.carries(scene, objects, k)
-            else charge(candidate.box, self._start(scene, _suspect(candidate), track), share)
-            for k, (candidate, track, share) in enumerate(new, first)
-        )
+        for k, (candidate, track, share) in enumerate(new, first):
+            collides = self._suggestions.collides(scene, objects, k)
+            if not collides and self._suggestions.carries(scene, objects, k):
+                charges.append(before)
+            else:
+                start = self._start(scene, _suspect(candidate), track)
+                charges.append(charge(candidate.box, start, 1.0 if collides else share))
+        return tuple(charges)
 
     def _start(self, scene: ObservedScene, suspect: Suspect, track: Track) -> LonePose:
         rise, claim, explained = self._filter.worth(scene, suspect, track)

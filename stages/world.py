@@ -26,7 +26,7 @@ _DRIFT = 0.01
 """Metres that an object may move while the scene settles before the arrangement counts as failed."""
 _TILT = 0.995
 """Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
-_DRAWS = 200
+_DRAWS = 1000
 
 
 class World(SimulatedRobot):

@@ -106,6 +106,16 @@ def _supporters(standing: Sequence[Standing], tolerances: Tolerances) -> dict[st
     return found
 
 
+def penetration(a: Standing, b: Standing, tolerances: Tolerances) -> float:
+    """Metres by which one of two upright objects would have to move for neither to be inside the other; 0 where one
+    carries the other, or one of them leans."""
+    carried = contact_area(a, b, tolerances) > 0 or contact_area(b, a, tolerances) > 0
+    if carried or not (a.stance.aligned and b.stance.aligned):
+        return 0.0
+    upwards = min(a.z_top, b.z_top) - max(a.z_bottom, b.z_bottom)
+    return max(0.0, min(upwards, -regions.separation(a.outline, b.outline)))
+
+
 def contact_area(upper: Standing, lower: Standing, tolerances: Tolerances) -> float:
     """Square metres over which ``lower`` may carry ``upper``; 0 where heights or regions do not meet."""
     bottom = regions.area(upper.bottom)

@@ -121,7 +121,8 @@ class Draft:
     def moved_with(self, start: Draft) -> Iterator[Draft]:
         """What stands in, on and beside an object that the hand cannot take, where that object is at the ``start``.
 
-        Once for each of its symmetries with which all of that is on the table; once, and empty, where there is none.
+        Once for each of its symmetries with which all of that is on the table and in sight; once, and empty, where
+        there is nothing of the kind.
         """
         fixed = next((name for name, item in self.placed.items() if not item.stance.item.grasps), "")
         if fixed not in start.placed:
@@ -134,8 +135,10 @@ class Draft:
             placed = {
                 name: self._at(name, T @ item.T_table_object) for name, item in self.placed.items() if name in names
             }
-            if all(self._is_carried(item, TABLE) for item in placed.values() if self.supports[item.name] == TABLE):
-                yield self._with(placed, start)
+            moved = self._with(placed, start)
+            on_table = (item for item in placed.values() if self.supports[item.name] == TABLE)
+            if all(self._is_carried(item, TABLE) for item in on_table) and moved._is_seen():
+                yield moved
 
     def _with(self, placed: dict[str, Standing], start: Draft) -> Draft:
         """The same with other objects, on the table of ``start``."""

@@ -116,7 +116,7 @@ class Drawn(Suite):
         elif self._goal is not None and all(
             stuck(self.robot, there.placed, there.supports, self.table) for there in self._goal.moved_with(draft)
         ):
-            raise Rejected("the goal is out of reach around what cannot be moved")
+            raise Rejected("the goal is out of reach or sight around what cannot be moved")
         return draft.layout
 
     def _fixed(self) -> dict[str, Standing]:

@@ -12,7 +12,7 @@ _FLAT = ("tea_box", "sugar_box", "cereal_box", "soup_can", "tuna_can", "sponge")
 _SLOTS = [(x, y) for x in (-0.127, 0.0, 0.127) for y in (-0.065, 0.065)]
 """Metres in the tray's frame: with all of them taken the tray is full."""
 _ORDERED = 20
-"""Draws of a full tray after which its objects change places."""
+"""Draws of a full tray after which its objects change places: whether all are in sight is a matter of their order."""
 
 
 class Swap(Drawn):
@@ -21,7 +21,7 @@ class Swap(Drawn):
     def choose(self, rng: np.random.Generator) -> None:
         """The kind of exchange, and one or two objects beside it."""
         self._exchange = (self._circle, self._tower, self._tray)[rng.integers(3)]
-        self._goals = 0
+        self._draws: dict[Kind, int] = {"goal": 0, "start": 0}
         flat = rng.permutation(_FLAT).tolist()
         small = rng.permutation([name for name in graspable(self.catalogue) if name != "bowl"]).tolist()
         if self._exchange == self._tray:
@@ -40,9 +40,8 @@ class Swap(Drawn):
 
     def draw(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """The exchange, one way round as goal and the other way round as start."""
-        self._goals += kind == "goal"
-        if kind == "goal" and self._exchange == self._tray and self._goals > _ORDERED:
-            # Whether all are in sight is a matter of their order.
+        self._draws[kind] += 1
+        if kind == "goal" and self._exchange == self._tray and self._draws[kind] > _ORDERED:
             self._parts = rng.permutation(self._parts).tolist()
         self._exchange(kind, draft)
         for name in self._beside:
@@ -62,11 +61,12 @@ class Swap(Drawn):
             support = name
 
     def _tray(self, kind: Kind, draft: Draft) -> None:
-        """Every slot taken, by the next object at the start."""
+        """Every slot taken, at the start by the next object, or by one farther on."""
         put(draft, "tray")
         T = draft.placed["tray"].T_table_stance
         yaw = float(np.arctan2(T[1, 0], T[0, 0]))
+        onward = 1 + self._draws["start"] // _ORDERED % (len(_SLOTS) - 1) if kind == "start" else 0
         for k, name in enumerate(self._parts):
-            slot = _SLOTS[(k + (kind == "start")) % len(_SLOTS)]
+            slot = _SLOTS[(k + onward) % len(_SLOTS)]
             if not draft.put_at(name, "tray", (T @ [*slot, 0, 1])[:2], yaw):
                 raise Rejected("no room in sight")

@@ -111,14 +111,17 @@ def equalled(best: Posterior, offers: Sequence[Offer]) -> list[Revision]:
 
 
 def suggested(best: Posterior, offers: Sequence[Offer], before: Sequence[float] = ()) -> list[Revision]:
-    """Revisions in which something comes in that the best scene suggests, the last of the offers; nothing in a box that
-    leaves something unexplained itself, of which :func:`revisions` takes care first."""
+    """Revisions in which something comes in that the best scene suggests, the last of the offers; not what a box that
+    leaves something unexplained itself may show, of which the other revisions take care first."""
     everything = tuple(range(len(best.objects)))
-    boxes = [offers[k].candidate.box for k in _left_open(best, before) if not offers[k].instead]
+    open_boxes = [offers[k].candidate for k in _left_open(best, before)]
     return [
         Revision(everything, (k,))
         for k in range(len(best.unexplained), len(offers))
-        if not any(shared(box, offers[k].candidate.box) > SHARED for box in boxes)
+        if not any(
+            shared(each.box, offers[k].candidate.box) > SHARED and each.label == offers[k].candidate.label
+            for each in open_boxes
+        )
     ]
 
 

@@ -51,6 +51,13 @@ class Suggestions:
         rest = [*objects[:k], *objects[k + 1 :]]
         return len(self._gaps(self._standing(scene, rest))) > len(self._gaps(self._standing(scene, objects)))
 
+    def collides(self, scene: ObservedScene, objects: Sequence[ObjectPose], k: int) -> bool:
+        """Whether the object with index ``k`` is farther inside another one than a pose may be off."""
+        standing, tolerances = self._standing(scene, objects), relations.Tolerances()
+        own = standing.pop(objects[k].name)
+        depths = (relations.penetration(own, other, tolerances) for other in standing.values())
+        return any(depth > tolerances.contact for depth in depths)
+
     def _unknown(self, scene: ObservedScene, layers: Sequence[Float32s]) -> Iterator[Offer]:
         """Every object that is large enough in every region that no object explains, at first those as high as it."""
         for region in unknown_regions(scene, layers):

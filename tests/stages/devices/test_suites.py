@@ -15,6 +15,7 @@ from stages.devices.suites import kinds
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.suites.reach import stuck
 from stages.devices.tabletop import HIDDEN, least_shown
+from stages.geometry.poses import inverse
 from stages.messages import Arrangement, LookRequest, RobotCommand, RobotState, Snapshot
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.relations import Tolerances, supports
@@ -179,6 +180,32 @@ def test_what_belongs_beside_the_tray_needs_room_there() -> None:
     assert not stuck(ROBOT, there.placed, there.supports, TABLE)
     at_the_edge = draft(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0)
     assert all(stuck(ROBOT, one.placed, one.supports, TABLE) for one in goal.moved_with(at_the_edge))
+
+
+def test_what_belongs_beside_the_tray_is_in_sight_there() -> None:
+    """The near corners of the table are not in the camera's image: what belongs there could not be seen to stand."""
+
+    def draft(y: float) -> Draft:
+        made = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=1.0)
+        assert made.put_at("tray", "table", np.array([0.7, y]), np.pi / 2)
+        return made
+
+    goal = draft(0.0)
+    assert goal.put_at("salt_shaker", "table", np.array([0.52, -0.15]), 0.0)
+    assert goal.put_at("soup_can", "table", np.array([0.51, 0.1]), 0.0)
+    assert any(there.placed for there in goal.moved_with(draft(0.05)))
+    assert not any(there.placed for there in goal.moved_with(draft(-0.3)))
+
+
+@pytest.mark.parametrize("seed", [443, 452, 577])
+def test_a_full_tray_is_drawn_until_all_is_in_sight(seed: int) -> None:
+    """Here that takes hundreds of draws, or only succeeds where objects go farther than to the next place."""
+    goal, start, _ = looks("swap", seed)
+    assert sorted(goal.names) == sorted(start.names)
+    where = [dict(zip(each.names, each.T_base_objects, strict=True)) for each in (goal, start)]
+    beside = [{name: (inverse(one["tray"]) @ T)[:2, 3] for name, T in one.items()} for one in where]
+    moved = [name for name in beside[0] if np.linalg.norm(beside[0][name] - beside[1][name]) > 0.1]
+    assert len(moved) >= 6
 
 
 def test_unknown_suites_and_goals_are_refused_with_the_choices() -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.scene.relations import Tolerances, gaps
+from stages.scene.relations import Tolerances, gaps, penetration
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, stances
 
@@ -164,3 +164,33 @@ def test_what_lies_on_the_rim_all_round_does_not_hang(upper: str):
     layout.poses[upper][2, 3] += standing[0].z_top - standing[1].z_bottom
     standing = [Standing.at(name, stances(name), T) for name, T in layout.poses.items()]
     assert gaps(standing, layout.graph().assertions, Tolerances()) == {}
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "sunk", "expected"),
+    [
+        ("sponge", "tea_box", 0.0, 0.0),
+        ("tea_box", "tea_box_2", 0.037, 0.037),
+        ("tray", "soup_can", 0.0, 0.0),
+        ("cup", "salt_shaker", 0.02, 0.0),
+    ],
+)
+def test_an_object_penetrates_another_one_unless_it_is_on_or_in_it(
+    lower: str, upper: str, sunk: float, expected: float
+):
+    layout = Layout().put(lower, 0, 0).put(upper, 0, 0, on=lower)
+    layout.poses[upper][2, 3] -= sunk
+    a, b = (Standing.at(name, stances(name.removesuffix("_2")), T) for name, T in layout.poses.items())
+    assert penetration(a, b, Tolerances()) == pytest.approx(expected, abs=2e-3)
+    assert penetration(b, a, Tolerances()) == penetration(a, b, Tolerances())
+
+
+def test_neighbours_penetrate_each_other_by_the_shortest_way_out():
+    layout = Layout().put("soup_can", 0, 0).put("tea_box", 0, 0)
+    a, b = (Standing.at(name, stances(name), T) for name, T in layout.poses.items())
+    width = np.ptp(a.outline[:, 0])
+    layout.poses["soup_can"][0, 3] = np.ptp(b.outline[:, 0]) / 2 + width / 2 - 0.03
+    a = Standing.at("soup_can", stances("soup_can"), layout.poses["soup_can"])
+    assert penetration(a, b, Tolerances()) == pytest.approx(0.03, abs=2e-3)
+    layout.poses["soup_can"][0, 3] += 0.04
+    assert penetration(Standing.at("soup_can", stances("soup_can"), layout.poses["soup_can"]), b, Tolerances()) == 0.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate, ObjectPose, Posterior
 from stages.messages.digest import Contender, Offer
-from stages.perception.hypotheses.revisions import Revision, combined, equalled
+from stages.perception.hypotheses.revisions import Revision, combined, equalled, suggested
 
 LEFT, RIGHT = np.array([0.0, 0, 40, 60]), np.array([100.0, 0, 140, 60])
 
@@ -86,3 +87,12 @@ def test_what_stands_in_the_box_of_another_object_may_be_an_equal_of_it():
     )
     assert equalled(posterior(0, -90.0, 0, 1, 4, offers=offers), offers) == [Revision((0, 2), (2,))]
     assert equalled(posterior(0, -90.0, 0, 2, 4, offers=offers), offers) == []
+
+
+def test_what_hangs_is_carried_by_something_though_a_box_below_it_leaves_something_open():
+    """That box is tried first, by each label that it may have; what it may not show is tried at once."""
+    below, gap = np.array([10.0, 60, 50, 80]), np.array([0.0, 50, 60, 80])
+    offers = offered(("tea_box", LEFT, False), ("tuna_can", below, False), ("cup", below, True))
+    offers += offered(("tuna_can", gap, True), ("sponge", gap, True))
+    best = msgspec.structs.replace(posterior(0, -90.0, 0, offers=offers), unexplained=(0.0, 0.2, 0.2))
+    assert suggested(best, offers) == [Revision((0,), (4,))]
