@@ -173,12 +173,15 @@ class Planner(Stage):
 
     def _another_way(self, task: Task, problem: Problem, blocked: Blocked, refused: Plan, ctx: Context) -> Plan:
         """What the search does not find. Where an object is in the way of the hand that puts another one beside it, the
-        other one comes first; else one transfer is planned after the other."""
-        taught = task.goal
-        beside = problem.graspable.issuperset(problem.beside(blocked.step.item))
-        if blocked.step.parent in blocked.obstacles and beside:
-            ctx.log(f"{refused.reason}; places {blocked.step.item} first")
-            plan = self._plan(replace_fields(task, goal=rerooted(taught, blocked.step.item)), taught, ctx)
+        other one comes first; else one transfer is planned after the other, unless there is no such place beside what
+        nobody can move."""
+        taught, step = task.goal, blocked.step
+        if step.region and not (blocked.why or problem.graspable.intersection(blocked.involved - {step.item})):
+            return refused
+        beside = problem.graspable.issuperset(problem.beside(step.item))
+        if step.parent in blocked.obstacles and beside:
+            ctx.log(f"{refused.reason}; places {step.item} first")
+            plan = self._plan(replace_fields(task, goal=rerooted(taught, step.item)), taught, ctx)
             if plan.status == "solved":
                 return plan
         ctx.log(f"{refused.reason}; plans one transfer after the other")

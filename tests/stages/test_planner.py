@@ -467,6 +467,18 @@ def test_without_room_within_reach_the_task_is_refused():
     assert found.reason == "no room on the table for soup_can within reach"
 
 
+def test_a_place_beyond_the_tables_edge_beside_what_nobody_can_move_is_refused_at_once():
+    goal = Layout().put("tray", 0, 0).put("tuna_can", 0, -0.2).put("tea_box", 0.1, 0, on="tray")
+    start = Layout().put("tray", -0.1, 0).put("tuna_can", 0, 0.3).put("tea_box", 0.1, 0.35)
+    start = msgspec.structs.replace(
+        start.graph(), support=np.array([[-0.4, -0.2], [0.4, -0.2], [0.4, 0.2], [-0.4, 0.2]])
+    )
+    context = Recorded()
+    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=start), context)
+    assert found.reason == "no room on the table for tuna_can within reach"
+    assert not any("plans one transfer after the other" in line for line in context.lines)
+
+
 @pytest.mark.parametrize("unknown", ["goal", "current"])
 def test_a_scene_of_a_camera_that_does_not_know_where_it_is_is_no_place_to_move_in(unknown: str):
     scenes = {"goal": breakfast().graph(), "current": START.graph()}
