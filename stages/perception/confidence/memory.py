@@ -90,17 +90,16 @@ class Memory:
     def named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
         """Equal objects with the names of those that are known where they stand: who moved one knows where it went.
 
-        The only one of its kind keeps its name where that is known, or where none is known for its place.
+        Where none is known to have stood, the only one of its kind keeps its name.
         """
         labels = [item.label for item in scene.objects]
-        alone = [labels.count(label) == 1 for label in labels]
         if not known or not labels:
             return scene
         before = {name: Named(item.label, item.T_base_object[:3, 3]) for name, item in known.items()}
         kept = names_kept(labels, np.stack([item.T_base_object[:3, 3] for item in scene.objects]), before)
         kept = [
-            item.name if only and (item.name in known or name is None) else name
-            for item, only, name in zip(scene.objects, alone, kept, strict=True)
+            item.name if name is None and labels.count(item.label) == 1 else name
+            for item, name in zip(scene.objects, kept, strict=True)
         ]
         return self.renamed(scene, unique_names(labels, kept))
 

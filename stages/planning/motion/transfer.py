@@ -48,6 +48,8 @@ _TOUCH, _BUMP = 4.0, 7.0
 """Newtons at the hand that are a touch in slow motions, and in fast ones, in which servos lag behind."""
 _BORNE = 0.3
 """Share of an object's weight that the hand feels, at least, once it is lifted: it may weigh half of what is known."""
+_FELT = 0.2
+"""Newtons up to which the hand cannot tell a weight from how it strains once it has closed beside a middle."""
 _PRESS = 12.0
 """Newtons from which on a finger does not slip past the object but stands on it."""
 _ASIDE = 0.012
@@ -258,7 +260,8 @@ class TransferRoutine:
         self._log(f"{world.carried}: grasped with {grasp.name!r}, {1e3 * state.gripper_width:.0f} mm wide")
         narrowest, widest = self._held_between(grasp.width)
         holding = Guard(narrowest=narrowest, widest=widest)
-        lifting = replace(holding, load=_BORNE * self._weight)
+        load = _BORNE * self._weight
+        lifting = replace(holding, load=load if load > _FELT else 0.0)
         try:
             yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
         except _BrokenOff as broken:

@@ -137,6 +137,11 @@ def test_the_only_one_of_its_kind_keeps_the_name_that_is_known_where_it_stands()
         assert names(MEMORY.named(graph({"sponge_2": seen}), known({"sponge": here}))) == [expected]
 
 
+def test_the_only_one_that_is_seen_of_two_is_the_one_that_is_known_where_it_stands() -> None:
+    here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
+    assert names(MEMORY.named(graph({"sponge": there}), known({"sponge": here, "sponge_2": there}))) == ["sponge_2"]
+
+
 @pytest.mark.parametrize(
     ("probability", "off", "kept"), [(0.6, 0.01, True), (0.95, 0.01, False), (0.6, 0.03, False), (None, 0.01, False)]
 )
