@@ -153,7 +153,8 @@ class Planner(Stage):
         text = problem_pddl(task.goal_name, problem, task.current, task.goal)
         if not violated:
             return _answer("satisfied", text)
-        if (steps := search.continued(task.then, problem)) and task.goal is taught:
+        steps = search.continued(task.then, problem)
+        if steps and steps[0].key not in task.avoid and task.goal is taught:
             targets, scene = self._targets(problem, task, taught, ctx), self._scene(task)
             poses = targets.of(
                 steps, scene, again=_failed_before(steps, task.avoid), late=problem.items, what="the rest"

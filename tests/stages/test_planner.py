@@ -315,8 +315,20 @@ def test_a_neighbour_that_keeps_the_hand_away_is_moved_first():
 def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
     assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]
-    again = [transfer.key for transfer in plan(crowded_goal(), near, avoid=("tea_box: table -> tray",)).transfers]
+    found = plan(crowded_goal(), near, avoid=("tea_box: table -> tray",))
+    again = [transfer.key for transfer in found.transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
+
+
+def test_a_plan_whose_next_transfer_failed_is_not_gone_on_with():
+    near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
+    then = tuple(
+        action for transfer in plan(crowded_goal(), near).transfers for action in (transfer.pick, transfer.place)
+    )
+    task = Task(goal_name="goal", goal=crowded_goal().graph(), current=near.graph(), then=then)
+    failed = msgspec.structs.replace(task, avoid=("tea_box: table -> tray",))
+    first = [planner().on_task(each, Recorded()).transfers[0].object for each in (task, failed)]
+    assert first == ["tea_box", "water_bottle"]
 
 
 def test_of_two_that_stand_close_the_one_that_leaves_the_hand_room_is_placed_last():

@@ -33,6 +33,8 @@ _CONTENT = 0.5
 """Share of a container's footprint up to which something may stand in it wherever its floor is."""
 _BESIDE = 0.005
 """Metres that something may be estimated beside the floor on which it stands."""
+_WALL = 0.003
+"""Metres of a container's wall that stands around what is in it."""
 
 
 class Memory:
@@ -129,6 +131,7 @@ class Memory:
         areas = [regions.area(one.outline) for one in (a, b)]
         outer, inner = (a, b) if areas[0] > areas[1] else (b, a)
         fits = regions.inside(inner.bottom, outer.floor, margin=-_BESIDE)
+        fits &= regions.inside(inner.outline, outer.outline, margin=_WALL)
         if outer.stance.cavity and (fits or min(areas) < _CONTENT * max(areas)):
             return False
         level = a.z_bottom < b.z_top and b.z_bottom < a.z_top

@@ -202,3 +202,13 @@ def test_one_more_than_are_known_keeps_out_of_their_names() -> None:
     seen = {"sponge_2": new, "sponge": there, "sponge_3": here}
     scene = completed(seen, {"sponge": here, "sponge_2": there}, {})
     assert names(scene) == ["sponge_3", "sponge_2", "sponge"]
+
+
+def test_a_mug_of_which_a_part_was_taken_for_a_cup_is_no_mug_with_a_cup_in_it() -> None:
+    layout = Layout().put("mug", 0.0, 0.0).put("cup", -0.0115, 0.0)
+    before = known(layout.poses)["cup"]
+    before = msgspec.structs.replace(before, probability=0.96, visible=0.28)
+    sure = tuple(msgspec.structs.replace(item, probability=0.99) for item in graph(layout.poses).objects[:1])
+    mug = {"mug": layout.poses["mug"]}
+    seen = msgspec.structs.replace(graph(mug), objects=sure)
+    assert names(MEMORY.complete(seen, {"cup": before}, observation(mug))) == ["mug"]
