@@ -236,10 +236,12 @@ class Targets:
         options = self._options(step, rest, scene, step in again)
         if isinstance(options, Blocked):
             return options
-        places, failed = options.places, None
-        for number in islice(self._tried(step, options, rest, scene), BRANCHES if self._tries > 0 else 1):
+        places, failed, is_late = options.places, None, step.item in late
+        stays = step.item not in self._turned and all(later.item != step.item for later in rest)
+        tried = self._tried(step, options, rest, scene, clear=is_late and stays)
+        for number in islice(tried, BRANCHES if self._tries > 0 else 1):
             self._tries -= 1
-            if step.item not in late and self._crowds(places[number], rest, scene):
+            if not is_late and self._crowds(places[number], rest, scene):
                 return Crowded(step)
             onward = self._chosen(rest, scene.after(step.item, places[number], step.destination), again, late)
             if isinstance(onward, list):
@@ -289,19 +291,24 @@ class Targets:
             self._known[key] = Options(places, handled, blocked) if handled else blocked
         return self._known[key]
 
-    def _tried(self, step: Step, options: Options, rest: Sequence[Step], scene: Scene) -> Iterator[int]:
-        """Numbers of places that the hand reaches: those where what goes beside the object follows, first; and those
-        from which an object that must be turned can be taken to where it belongs."""
+    def _tried(
+        self, step: Step, options: Options, rest: Sequence[Step], scene: Scene, *, clear: bool = False
+    ) -> Iterator[int]:
+        """Numbers of places that the hand reaches: those where what goes beside the object follows, first; those from
+        which an object that must be turned can be taken to where it belongs; and those of an object that comes no later
+        than it must where it is in nobody's way."""
         children = [other for other in rest if other.parent == step.item]
         children += [other for other in rest if other.item == step.item and step.item in self._turned]
-        late: list[int] = []
+        hindered: list[int] = []
         for number in islice(options.handled.places(), FOLLOWED if children else None):
-            after = scene.after(step.item, options.places[number], step.destination)
-            if all(self._follows(child, step.item, after) for child in children):
+            place = options.places[number]
+            after = scene.after(step.item, place, step.destination)
+            crowds = clear and self._crowds(place, rest, scene)
+            if not crowds and all(self._follows(child, step.item, after) for child in children):
                 yield number
             else:
-                late.append(number)
-        yield from late
+                hindered.append(number)
+        yield from hindered
 
     def _follows(self, child: Step, parent: str, scene: Scene) -> bool:
         """Whether a step can be done once its parent is where it is, at least after others have moved; the next step of

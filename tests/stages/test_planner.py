@@ -320,6 +320,16 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
 
 
+def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere():
+    """A tower turned over: its lowest box belongs right beside the sponge that goes onto it next."""
+    goal = Layout().put("sugar_box", 0.05, 0.09, yaw=0.3).put("sponge", 0, 0, on="sugar_box")
+    start = Layout().put("tuna_can", 0.02, 0.03).put("sponge", 0, 0, on="tuna_can").put("sugar_box", 0, 0, on="sponge")
+    first, second = plan(goal, start).transfers
+    assert (first.object, second.object) == ("sugar_box", "sponge")
+    place = (inverse(T_BASE_TABLE) @ first.T_base_targets[0])[:2, 3]
+    assert np.linalg.norm(place - start.poses["sponge"][:2, 3]) > 0.13
+
+
 def test_a_plan_whose_next_transfer_failed_is_not_gone_on_with():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
     then = tuple(
