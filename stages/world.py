@@ -27,6 +27,7 @@ _DRIFT = 0.01
 _TILT = 0.995
 """Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
 _DRAWS = 1000
+"""Of one scene before it counts as impossible: full trays take hundreds, of a few milliseconds each."""
 
 
 class World(SimulatedRobot):

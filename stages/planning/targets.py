@@ -294,9 +294,9 @@ class Targets:
     def _tried(
         self, step: Step, options: Options, rest: Sequence[Step], scene: Scene, *, clear: bool = False
     ) -> Iterator[int]:
-        """Numbers of places that the hand reaches: those where what goes beside the object follows, first; those from
-        which an object that must be turned can be taken to where it belongs; and those of an object that comes no later
-        than it must where it is in nobody's way."""
+        """Numbers of places that the hand reaches, first those where what goes beside the object follows, from which an
+        object that must be turned can be taken to where it belongs and, if it is to be ``clear``, that leave the hand
+        room for what is still to be picked."""
         children = [other for other in rest if other.parent == step.item]
         children += [other for other in rest if other.item == step.item and step.item in self._turned]
         hindered: list[int] = []

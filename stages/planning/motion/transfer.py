@@ -49,7 +49,7 @@ _TOUCH, _BUMP = 4.0, 7.0
 _BORNE = 0.3
 """Share of an object's weight that the hand feels, at least, once it is lifted: it may weigh half of what is known."""
 _FELT = 0.2
-"""Newtons up to which the hand cannot tell a weight from how it strains once it has closed beside a middle."""
+"""Newtons up to which the hand cannot tell a weight from its own strain, where it did not close on the very middle."""
 _PRESS = 12.0
 """Newtons from which on a finger does not slip past the object but stands on it."""
 _ASIDE = 0.012

@@ -166,35 +166,30 @@ def test_what_stands_where_no_hand_fits_is_stuck() -> None:
     assert stuck(ROBOT, draft.placed, draft.supports, TABLE) == {"mug", "salt_shaker"}
 
 
-def test_what_belongs_beside_the_tray_needs_room_there() -> None:
-    def draft(x: float, y: float) -> Draft:
-        made = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=1.0)
-        assert made.put_at("tray", "table", np.array([x, y]), np.pi / 2)
-        return made
+def with_tray(x: float, y: float) -> Draft:
+    made = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=1.0)
+    assert made.put_at("tray", "table", np.array([x, y]), np.pi / 2)
+    return made
 
-    goal = draft(0.7, 0.0)
+
+def test_what_belongs_beside_the_tray_needs_room_there() -> None:
+    goal = with_tray(0.7, 0.0)
     depth = np.ptp(goal.placed["tray"].outline[:, 0])
     assert goal.put_at("salt_shaker", "table", np.array([0.7 - depth / 2 - 0.04, 0.0]), 0.0)
-    there = next(goal.moved_with(draft(0.7, 0.1)))
+    there = next(goal.moved_with(with_tray(0.7, 0.1)))
     assert there.placed.keys() == {"tray", "salt_shaker"}
     assert not stuck(ROBOT, there.placed, there.supports, TABLE)
-    at_the_edge = draft(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0)
+    at_the_edge = with_tray(TABLE.center[0] - TABLE.size[0] / 2 + depth / 2 + 0.03, 0.0)
     assert all(stuck(ROBOT, one.placed, one.supports, TABLE) for one in goal.moved_with(at_the_edge))
 
 
 def test_what_belongs_beside_the_tray_is_in_sight_there() -> None:
     """The near corners of the table are not in the camera's image: what belongs there could not be seen to stand."""
-
-    def draft(y: float) -> Draft:
-        made = Draft(catalogue(), shapes(catalogue()), np.random.default_rng(0), robot=ROBOT, table=TABLE, hidden=1.0)
-        assert made.put_at("tray", "table", np.array([0.7, y]), np.pi / 2)
-        return made
-
-    goal = draft(0.0)
+    goal = with_tray(0.7, 0.0)
     assert goal.put_at("salt_shaker", "table", np.array([0.52, -0.15]), 0.0)
     assert goal.put_at("soup_can", "table", np.array([0.51, 0.1]), 0.0)
-    assert any(there.placed for there in goal.moved_with(draft(0.05)))
-    assert not any(there.placed for there in goal.moved_with(draft(-0.3)))
+    assert any(there.placed for there in goal.moved_with(with_tray(0.7, 0.05)))
+    assert not any(there.placed for there in goal.moved_with(with_tray(0.7, -0.3)))
 
 
 @pytest.mark.parametrize("seed", [443, 452, 577])
