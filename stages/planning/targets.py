@@ -236,7 +236,8 @@ class Targets:
         options = self._options(step, rest, scene, step in again)
         if isinstance(options, Blocked):
             return options
-        places, failed, is_late = options.places, None, step.item in late
+        places, is_late = options.places, step.item in late
+        failed: Blocked | None = None
         stays = step.item not in self._turned and all(later.item != step.item for later in rest)
         tried = self._tried(step, options, rest, scene, clear=is_late and stays)
         for number in islice(tried, BRANCHES if self._tries > 0 else 1):
@@ -247,9 +248,9 @@ class Targets:
             if isinstance(onward, list):
                 offered = _alike_from(number, places[: max(self._workspace.targets, number + FEWEST)])
                 return [self._harmless(offered, step, rest, scene, [one[0] for one in onward]), *onward]
-            failed = onward
             if isinstance(onward, Crowded) or step.item not in onward.involved:
-                break
+                return onward
+            failed = replace(failed, crowding=failed.crowding | onward.involved) if failed else onward
         return _trouble(step, options, failed)
 
     def _harmless(
@@ -468,8 +469,8 @@ class Targets:
         return spots
 
 
-def _trouble(step: Step, options: Options, failed: Blocked | Crowded | None) -> Blocked | Crowded:
-    """Why a step leads nowhere: none of its places is reached, or what the last one led to ``failed``.
+def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:
+    """Why a step leads nowhere: none of its places is reached, or what the first one led to ``failed``.
 
     Where that is without any room, the step itself is blocked by what takes up other places of it.
     """
@@ -477,8 +478,6 @@ def _trouble(step: Step, options: Options, failed: Blocked | Crowded | None) -> 
     if failed is None:
         why, obstacles = options.handled.why_not()
         return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why)
-    if isinstance(failed, Crowded) or step.item not in failed.involved:
-        return failed
     if not failed.obstacles and blocked.obstacles:
         return blocked
     return replace(failed, crowding=failed.crowding | blocked.crowding)
