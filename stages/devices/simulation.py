@@ -13,7 +13,7 @@ import numpy as np
 from stages.devices.servo import Servo
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
-from stages.planning.motion.collision import add_primitives, add_table, quaternion
+from stages.planning.motion.collision import add_floor, add_primitives, add_table, quaternion
 from stages.robots import Robot, Table
 from stages.scene.catalogue import Catalogue, CatalogueObject
 from stages.scene.scoring import label_of
@@ -189,8 +189,7 @@ def scene_model(
     option.enableflags |= _SLEEP
     # The sparse Newton factorisation of MuJoCo 4.0.0 is broken.
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
-    floor.pos = [0, 0, robot.floor]
+    add_floor(spec, robot.floor)
     add_table(spec, table)
     for name in names:
         _add_object(spec, name, catalogue[label_of(name, catalogue)], factors.get(name, Factors()))

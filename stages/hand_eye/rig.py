@@ -75,11 +75,6 @@ class Rig:
         """The robot with the board at ``Y`` (T_boardlink_board), its plate larger by ``clearance`` metres."""
         return _with(self.robot, _plate(self.board, Y, self.held, clearance), on=self.link)
 
-    def in_room(self, clearance: float) -> Robot:
-        """The robot as planning has it, with the board and the floor."""
-        floor = f'<geom type="box" size="3 3 0.1" pos="0 0 {self.robot.floor - 0.1}"/>'
-        return _with(self.with_board(self.Y, clearance=clearance), f'<body name="floor">{floor}</body>', on="")
-
 
 def _with(robot: Robot, body: str, *, on: str) -> Robot:
     text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"

@@ -37,7 +37,7 @@ class CalibrationRoutine:
 
     def __init__(self, rig: Rig, *, poses: int, limits: Limits, log: Callable[[str], None]) -> None:
         self._rig, self._poses, self._limits, self._log = rig, poses, limits, log
-        self._robot = rig.in_room(_ABOUT[rig.held])
+        self._robot = rig.with_board(rig.Y, clearance=_ABOUT[rig.held])
         self._world = CollisionWorld(self._robot, rig.robot.table, {}, clearance=_CLEARANCE)
         self._sights: list[Sight] = []
 

@@ -21,6 +21,12 @@ _ROBOT, _NEAR_ROBOT, _NEAR_HELD, _HELD = 1, 2, 4, 8
 """Contact bits: what the robot, what keeps clear of it, what keeps clear of the held object, the held object."""
 
 
+def add_floor(spec: Any, height: float) -> Any:
+    """Adds the floor, at a height in metres, to a MuJoCo specification as body ``floor``; returns its geom."""
+    body = spec.worldbody.add_body(name="floor", pos=[0, 0, height])
+    return body.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1])
+
+
 def add_table(spec: Any, table: Table) -> Any:
     """Adds the table to a MuJoCo specification as body ``table``; returns its geom."""
     body = spec.worldbody.add_body(name="table", pos=[*table.center, table.height - table.thickness / 2])
@@ -41,7 +47,7 @@ def quaternion(R: Floats) -> Floats:
 
 
 class CollisionWorld:
-    """One scene: the robot, the table, objects where they were perceived, and the one object to be carried, if any.
+    """One scene: robot, floor, table, objects where they were perceived, and the one object to be carried, if any.
 
     ``occupied`` are pieces in the base frame that nobody has named yet.
 
@@ -65,7 +71,7 @@ class CollisionWorld:
         self._model = self._compile(table, objects, occupied)
         self._data = mujoco.MjData(self._model)
         self._index_robot()
-        self._geoms = {name: self._geoms_of(name) for name in ("table", "occupied", *objects)}
+        self._geoms = {name: self._geoms_of(name) for name in ("floor", "table", "occupied", *objects)}
         self._held_geoms = self._geoms_of("held")
         self._obstacles = [geom for geoms in self._geoms.values() for geom in geoms]
         self._model.geom_margin[self._obstacles] = clearance
@@ -177,7 +183,7 @@ class CollisionWorld:
         for geom in spec.geoms:
             near_hand = 0 if geom.parent.name in links else _HELD
             geom.contype, geom.conaffinity = _ROBOT, _ROBOT | _NEAR_ROBOT | near_hand
-        obstacles = [add_table(spec, table)]
+        obstacles = [add_floor(spec, self.robot.floor), add_table(spec, table)]
         obstacles += add_primitives(spec.worldbody.add_body(name="occupied"), occupied)
         for name, (entry, T) in objects.items():
             body = spec.worldbody.add_body(name=name, mocap=True, pos=T[:3, 3], quat=quaternion(T[:3, :3]))

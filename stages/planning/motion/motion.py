@@ -27,8 +27,10 @@ _LARGEST_JUMP = 0.35
 """Radians between waypoints of a straight hand motion; more means a change of configuration."""
 _STRAIGHT_STEP = 0.01
 """Metres between waypoints of a straight hand motion."""
-FAST = 0.85
-"""Share of the joint limits for free motions."""
+FAST, SLOW = 0.85, 0.5
+"""Share of the joint limits for free motions, and for those next to objects."""
+RUB = 15.0
+"""Newtons that do not matter where the hand leaves what it touches."""
 _RESOLUTION = 0.02
 """Largest joint motion between collision checks of a path, radians (metres)."""
 _CHECKS = 15_000
@@ -139,8 +141,8 @@ def is_motion_free(world: CollisionWorld, waypoints: Floats, *, step: float = 0.
     return all(world.is_free(q) for q in densify(waypoints, step))
 
 
-def densify(waypoints: Floats, step: float) -> Floats:
-    """Inserts points so that no joint moves more than ``step`` between neighbours; repeated points are dropped."""
+def densify(waypoints: Floats, step: float = 0.05) -> Floats:
+    """Inserts points so that no joint moves more than ``step`` to the next, radians (metres); drops repeated points."""
     dense = [waypoints[0]]
     for a, b in pairwise(waypoints):
         distance = np.abs(b - a).max()
@@ -148,6 +150,12 @@ def densify(waypoints: Floats, step: float) -> Floats:
             pieces = int(np.ceil(distance / step))
             dense += [a + (b - a) * i / pieces for i in range(1, pieces + 1)]
     return np.array(dense)
+
+
+def back_along(way: Floats, q: Floats) -> tuple[float, Floats]:
+    """How far joint positions (J) are from a way (W x J), radians, and the way back along it, from them on."""
+    distances = np.abs(way - q).max(1)
+    return float(distances.min()), np.vstack([q, way[: distances.argmin()][::-1]])
 
 
 def robot_command(

@@ -13,7 +13,17 @@ from stages.geometry.poses import pose, random_rotations
 from stages.messages import Arrived, Outcome, PostureRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.planning.motion.collision import AMPLE, CollisionWorld
-from stages.planning.motion.motion import arm, free_motion, restarts, robot_command, solve_ik
+from stages.planning.motion.motion import (
+    RUB,
+    SLOW,
+    arm,
+    back_along,
+    densify,
+    free_motion,
+    restarts,
+    robot_command,
+    solve_ik,
+)
 from stages.robots import Robot
 from stages.scene.catalogue import Primitive
 
@@ -107,10 +117,16 @@ class PostureRoutine:
             reason = f"{state.reason} on the way to {label}" if state.stopped or state.shown else ""
         if reason:
             self._log(f"{self._request.label}: {reason}")
+        stopped = state.stopped
+        if path is not None and stopped == "touch":
+            _, back = back_along(densify(path), arm(self._robot, state))
+            state = yield robot_command(
+                self._robot, "go back the way it came", back, speed=SLOW, guard=Guard(force=RUB)
+            )
         return Arrived(
             success=not reason,
             reason=reason,
-            stopped=state.stopped,
+            stopped=state.stopped or stopped,
             joint_names=state.joint_names,
             positions=state.positions,
             robot_seconds=state.time - started,

@@ -16,7 +16,17 @@ from stages.messages import Outcome, RobotCommand, RobotState, TransferRequest
 from stages.messages.robot import Guard
 from stages.messages.task import FailedStage
 from stages.planning.motion.collision import CollisionWorld
-from stages.planning.motion.motion import FAST, arm, densify, free_motion, robot_command, straight_motion
+from stages.planning.motion.motion import (
+    FAST,
+    RUB,
+    SLOW,
+    arm,
+    back_along,
+    densify,
+    free_motion,
+    robot_command,
+    straight_motion,
+)
 from stages.planning.motion.pick_place import (
     LIFT,
     MARGINS,
@@ -36,8 +46,6 @@ Routine = Generator[RobotCommand, RobotState, "Outcome"]
 Steps = Generator[RobotCommand, RobotState, tuple[FailedStage, str]]
 """Yields commands, receives encoders, returns the failed stage ("" for success) and the reason."""
 
-_SLOW = 0.5
-"""Share of the joint limits for motions next to objects."""
 _GENTLE, _YIELDS = 0.1, 0.004
 """The same where a touch is wanted, and radians (metres) that a joint is held back by one: 3 mm at the hand."""
 _LOWEST = -0.008
@@ -54,8 +62,6 @@ _PRESS = 12.0
 """Newtons from which on a finger does not slip past the object but stands on it."""
 _ASIDE = 0.012
 """Metres by which the hand evades to either side when a finger comes down on the object: as much as there is room."""
-_RUB = 15.0
-"""Newtons that do not matter where the hand leaves what it has let go of."""
 _WIDER = 0.012
 """Metres by which the fingers may stand wider on an object than it is."""
 _EMPTY = 0.003
@@ -65,8 +71,6 @@ _WAYS_BACK = 4
 """Times that the way back is tried."""
 _AWAY = 0.05
 """Radians from home beyond which the arm first goes home, and from a straight way within which it returns along it."""
-_RETRACED = 0.05
-"""Radians between the waypoints of the way back that the hand came."""
 
 
 @dataclass
@@ -176,8 +180,8 @@ class TransferRoutine:
         """The empty hand goes back the way that it came, which was free."""
         if broken.waypoints is None:
             return broken.state
-        _, back = _back(densify(broken.waypoints, _RETRACED), self._arm(broken.state))
-        return (yield from self._do("go back the way it came", back, speed=_SLOW, guard=Guard(force=_RUB)))
+        _, back = back_along(densify(broken.waypoints), self._arm(broken.state))
+        return (yield from self._do("go back the way it came", back, speed=SLOW, guard=Guard(force=RUB)))
 
     def _stands(self, broken: _BrokenOff) -> tuple[FailedStage, str]:
         """The arm stays where it is."""
@@ -197,9 +201,9 @@ class TransferRoutine:
                 return (yield from self._put_back(at, state))
         yield from self._do("open the hand", width=self._robot.gripper.open_width)
         self.in_hand = ""
-        distance, back = _back(at.plan.pick.approach, q)
+        distance, back = back_along(at.plan.pick.approach, q)
         if distance < _AWAY:
-            yield from self._do("back off", back, speed=_SLOW)
+            yield from self._do("back off", back, speed=SLOW)
             q = back[-1]
         return (yield from self._home(at.world, q, rise=rise))
 
@@ -207,12 +211,12 @@ class TransferRoutine:
         """What is held, as it is held now, returns the way it came to where it was taken from: both are free and
         within reach."""
         pick, carried, q = at.plan.pick, at.world.carried, self._arm(state)
-        distance, lower = _back(pick.lift, q)
+        distance, lower = back_along(pick.lift, q)
         if distance > _AWAY:
-            way = densify(np.vstack([at.plan.carry, at.plan.place.lower]), _RETRACED)
+            way = densify(np.vstack([at.plan.carry, at.plan.place.lower]))
             narrowest, widest = self._held_between(state.gripper_width)
-            guard = Guard(narrowest=narrowest, widest=widest, force=_RUB + self._weight)
-            yield from self._do(f"carry {carried} back", _back(way, q)[1], speed=_SLOW, guard=guard)
+            guard = Guard(narrowest=narrowest, widest=widest, force=RUB + self._weight)
+            yield from self._do(f"carry {carried} back", back_along(way, q)[1], speed=SLOW, guard=guard)
             lower = pick.lift[::-1]
         # Straight down the way it came, but for the last waypoint: from there on it is felt for. What has slid in the
         # hand hangs lower by nobody knows how much.
@@ -263,7 +267,7 @@ class TransferRoutine:
         load = _BORNE * self._weight
         lifting = replace(holding, load=load if load > _FELT else 0.0)
         try:
-            yield from self._do(f"lift {world.carried}", lift, speed=_SLOW, guard=lifting)
+            yield from self._do(f"lift {world.carried}", lift, speed=SLOW, guard=lifting)
         except _BrokenOff as broken:
             if broken.state.stopped == "slip" and self._is_held(broken.state, grasp):
                 self.in_hand = ""  # The fingers slide along what they leave behind.
@@ -296,14 +300,14 @@ class TransferRoutine:
         approach, lift = pick.approach, pick.lift
         while True:
             try:
-                state = yield from self._do(label, approach, speed=_SLOW, width=0.0, guard=guard)
+                state = yield from self._do(label, approach, speed=SLOW, width=0.0, guard=guard)
             except _BrokenOff as broken:
                 evasion = next(evasions, None) if broken.state.stopped == "touch" else None
                 if evasion is None:
                     raise
                 self._log(f"{broken}; tries beside it")
-                _, back = _back(approach, self._arm(broken.state))
-                yield from self._do("back off", back, speed=_SLOW)
+                _, back = back_along(approach, self._arm(broken.state))
+                yield from self._do("back off", back, speed=SLOW)
                 approach, lift = evasion
             else:
                 return state, lift
@@ -331,7 +335,7 @@ class TransferRoutine:
         reason = f"the fingers closed to {1e3 * state.gripper_width:.0f} mm instead of {1e3 * expected:.0f}"
         self._log(f"{world.carried}: not grasped with {self._tally.grasp!r}: {reason}")
         yield from self._do("open the hand", width=self._robot.gripper.open_width)
-        yield from self._do("back off", plan.pick.approach[::-1], speed=_SLOW)
+        yield from self._do("back off", plan.pick.approach[::-1], speed=SLOW)
         failure = yield from self._home(world, plan.pick.approach[0])
         return failure if failure[0] else ("grasp", reason)
 
@@ -347,7 +351,7 @@ class TransferRoutine:
         narrowest, _ = self._held_between(place.hand.grasp.width)
         feeling = Guard(narrowest=narrowest, force=_TOUCH, error=_YIELDS)
         try:
-            state = yield from self._do(f"lower {world.carried}", place.lower, speed=_SLOW, guard=guard)
+            state = yield from self._do(f"lower {world.carried}", place.lower, speed=SLOW, guard=guard)
             if deeper is not None:
                 state = yield from self._do("feel for the support", deeper, speed=_GENTLE, guard=feeling)
             q = self._arm(state)
@@ -367,7 +371,7 @@ class TransferRoutine:
         self._tally.T_base_object = left
         retreat = at.planner.retreat(place.hand, q)
         retreat = place.lower[::-1] if retreat is None else retreat
-        yield from self._do("retreat", retreat, speed=_SLOW, guard=Guard(force=_RUB))
+        yield from self._do("retreat", retreat, speed=SLOW, guard=Guard(force=RUB))
         failure = yield from self._open_and_home(world, retreat[-1], wanted)
         if state.gripper_width < (held + wanted) / 2:
             self._tally.T_base_object = None
@@ -476,9 +480,3 @@ class TransferRoutine:
             T_base_object=tally.T_base_object,
             held=self.in_hand,
         )
-
-
-def _back(approach: Floats, q: Floats) -> tuple[float, Floats]:
-    """How far joint positions (J) are from an approach (W x J), radians, and the way back along it, from them on."""
-    distances = np.abs(approach - q).max(1)
-    return float(distances.min()), np.vstack([q, approach[: distances.argmin()][::-1]])

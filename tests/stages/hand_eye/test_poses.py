@@ -23,7 +23,7 @@ COUNT = 7
 @pytest.mark.parametrize("name", ["fetch", "ur5e_hand"])
 def test_poses_are_free_show_the_board_and_differ(name: str) -> None:
     rig = Rig(read_robot(FOLDER / f"{name}.yaml"), Board())
-    robot = rig.in_room(0.03)
+    robot = rig.with_board(rig.Y, clearance=0.03)
     world = CollisionWorld(robot, robot.table, {}, clearance=0.02)
     postures = proposed(rig, world, Sightlines(robot), COUNT, np.random.default_rng(0))
     assert len(postures) == COUNT
@@ -42,7 +42,7 @@ def test_poses_are_free_show_the_board_and_differ(name: str) -> None:
 
 def test_a_board_behind_the_table_is_not_seen() -> None:
     rig = Rig(read_robot(FOLDER / "ur5e.yaml"), Board())
-    lines = Sightlines(rig.in_room(0.0))
+    lines = Sightlines(rig.with_board(rig.Y))
     eye = inverse(rig.robot.T_camera_base)[:3, 3]
     x, y = rig.robot.table.center
     above, below = (np.array([[x, y, rig.robot.table.height + z]]) for z in (0.1, -0.2))

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,6 +22,10 @@ BOXES = np.array([
     [0.648, 0.127, 0.705, 0.824, 0.309, 0.907],
 ])  # fmt: skip
 """What stands on the table."""
+
+
+ON_THE_FLOOR = np.array([0.104, 0.289, 1.032, -0.809, 0.860, 1.099, 0.172, 0.204])
+"""The fingers, before the table."""
 
 
 def motions(request: PostureRequest) -> Iterator[RobotCommand]:
@@ -43,3 +48,31 @@ def test_the_arm_keeps_off_a_table_that_is_a_little_lower_than_is_said(off: floa
     found = list(motions(request))
     assert len(found) > 2
     assert {pair for motion in found for q in motion.positions for pair in true.contacts(q)} == set()
+
+
+def test_the_arm_keeps_off_the_floor() -> None:
+    world = CollisionWorld(ROBOT, ROBOT.table, {})
+    assert any("floor" in pair for pair in world.contacts(ON_THE_FLOOR))
+    assert world.contacts(ROBOT.home) == set()
+
+
+def test_after_a_touch_the_arm_goes_back_the_way_it_came() -> None:
+    """Where something is touched no motion is free, and the guard of the next one would stop it at once."""
+    request = PostureRequest(
+        joint_names=ROBOT.joints, positions=SHOWN, table_height=ROBOT.table.height, occupied=BOXES, label=""
+    )
+    state = RobotState(joint_names=ROBOT.joints, positions=ROBOT.home, gripper_width=0.1, time=0.0)
+    routine = PostureRoutine(request, robot=ROBOT, rng=np.random.default_rng(0), log=print).run()
+    next(routine)
+    there = routine.send(state)
+    halfway = len(there.positions) // 2
+    touched = msgspec.structs.replace(state, positions=there.positions[halfway], stopped="touch", reason="9 N")
+    back = routine.send(touched)
+    assert back.guard is not None and there.guard is not None and back.guard.force > there.guard.force
+    assert np.allclose(back.positions[0], touched.positions) and np.allclose(back.positions[-1], ROBOT.home)
+    for q in back.positions:
+        assert np.abs(there.positions[: halfway + 1] - q).max(1).min() < 0.05
+    with pytest.raises(StopIteration) as end:
+        routine.send(state)
+    assert (end.value.value.success, end.value.value.stopped) == (False, "touch")
+    assert np.allclose(end.value.value.positions, ROBOT.home)
