@@ -37,7 +37,7 @@ CROWDED = 0.08
 """Gap in metres below which an object stands in the way of the hand that picks its neighbour."""
 FAR = 0.1
 """Metres beyond which it does not matter how large a gap is exactly."""
-FARTHER = 0.03
+FARTHER = 0.07
 """Metres beyond the robot's reach within which something may be placed if the hand gets there."""
 FEWEST = 4
 """Poses offered for a transfer of which only late ones are within reach."""
@@ -396,8 +396,7 @@ class Targets:
         """
         if destination == TABLE:
             T_base_object = scene.T_base_table @ item.T_table_object
-            distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
-            within_reach = self._workspace.outside(T_base_object) == 0 and distance < self._robot.reach + FARTHER
+            within_reach = self._workspace.outside(T_base_object) == 0 and self._beyond_reach(T_base_object) < FARTHER
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
@@ -406,6 +405,10 @@ class Targets:
         middles = np.stack([regions.centroid(item.bottom), regions.centroid(surface)])
         depth, deepest = regions.depth(surface, middles)
         return bool(depth >= min(MIDDLE, 0.5 * deepest))
+
+    def _beyond_reach(self, T_base_object: Floats) -> float:
+        distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
+        return max(0.0, distance - self._robot.reach)
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
@@ -418,7 +421,7 @@ class Targets:
         return regions.inside(item.outline, scene.surface, margin=self._workspace.edge)
 
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
-        """Places on the table, near and with space around them, where nothing of the goal will stand."""
+        """Places on the table, near, well within reach, with space around, where nothing of the goal will stand."""
         item = scene.standing[step.item]
         others = scene.others(step.item, TABLE)
         reserved = [
@@ -435,7 +438,8 @@ class Targets:
                 continue
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
             crowded = max(0.0, self._workspace.spacing - min(room, free))
-            spots.append(Placement(spot, 0.2 * distance + 2 * crowded + _hidden(spot, others, scene)))
+            far = self._beyond_reach(scene.T_base_table @ spot.T_table_object)
+            spots.append(Placement(spot, 0.2 * distance + 2 * (crowded + far) + _hidden(spot, others, scene)))
         spots = sorted(spots, key=lambda placement: placement.cost)[: 2 * self._workspace.targets]
         if step.item in self._turned:
             spots += self._on_other_sides(item, spots, others, scene)

@@ -257,6 +257,27 @@ def test_what_stands_on_a_goal_object_is_put_aside_and_stays_within_reach():
     assert all(workspace.outside(T) < 1e-9 for T in found.transfers[0].T_base_targets)
 
 
+def test_what_is_put_aside_stays_well_within_reach():
+    """There is more room nearby, but only just within reach: where it is a little off, no hand takes it again."""
+
+    def table() -> Layout:
+        around = Layout().put("bowl", -0.04, 0.33).put("sponge", 0.06, 0.08).put("sugar_box", -0.07, 0.05)
+        return around.put("tea_box", 0.1, 0.25)
+
+    goal = table().put("tuna_can", 0, 0, on="tea_box")
+    start = table().put("soup_can", 0, 0, on="tea_box").put("tuna_can", -0.05, -0.15)
+    aside, _ = plan(goal, start).transfers
+    assert np.linalg.norm(aside.T_base_targets[0][:2, 3] - ROBOT.shoulder) < ROBOT.reach
+
+
+def test_what_belongs_beside_a_tray_that_stands_far_away_is_placed_as_far_as_the_hand_gets():
+    goal = Layout().put("tray", 0.04, -0.195, yaw=1.62).put("tea_box", 0.13, 0.121, yaw=0.89)
+    start = Layout().put("tray", 0.062, -0.231, yaw=1.38).put("tea_box", -0.08, 0.257, yaw=-0.12)
+    found = plan(goal, start)
+    assert [transfer.object for transfer in found.transfers] == ["tea_box"]
+    assert np.linalg.norm(found.transfers[0].T_base_targets[0][:2, 3] - ROBOT.shoulder) > ROBOT.reach + 0.03
+
+
 def test_a_child_is_placed_beside_its_parent_where_the_parent_is():
     goal = Layout().put("cereal_box", 0, 0).put("mug", 0.0, 0.13)
     start = Layout().put("cereal_box", 0.1, -0.1, yaw=0.7).put("mug", 0.05, 0.3)

@@ -20,10 +20,12 @@ from stages.perception.hypotheses.composition import Composition, claim, fit, gl
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue
 
-_IDLE = 0.01
+_IDLE = 0.05
 """An object explains nothing if it lowers the cost of the scene by a smaller share."""
 _LEFT = 0.1
 """An object in whose box a smaller share of what stands there is unexplained has nothing to gain from another visit."""
+_ASTRAY = 0.05
+"""An object that explains nothing, though a larger share of what stands in its box is unexplained, is sought anew."""
 _OPEN = 0.006
 """A reading is unexplained if it costs more, metres: noise and the edges of simplified meshes stay below."""
 _THIN = 1 / 256
@@ -243,10 +245,9 @@ class SceneFilter:
     def _visit(self, draft: _Draft, *, least: float, first: int) -> None:
         stale = set(range(len(draft.suspects)))
         for number in range(first, first + self._settings.sweeps):
-            if number == 1:
-                stale |= self._rescue(draft)
+            rescued = self._rescue(draft) if number == 1 else set[int]()
             left = draft.unexplained(draft.windows)
-            stale = self._sweep(draft, {i for i in stale if left[i] > least}, number)
+            stale = self._sweep(draft, rescued | {i for i in stale if left[i] > least}, number)
 
     def _sweep(self, draft: _Draft, stale: set[int], number: int) -> set[int]:
         """Visits the stale objects with all others known; returns those around which something changed.
@@ -274,7 +275,7 @@ class SceneFilter:
         share = self._settings.iterations // max(1, len(keys))
         changed: set[int] = set()
         for i, suspect in enumerate(draft.suspects):
-            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained(draft.windows)[i] <= _LEFT:
+            if draft.cost < draft.cost_without(i) * (1 - _IDLE) or draft.unexplained(draft.windows)[i] <= _ASTRAY:
                 continue
             track = self._run(draft.scene, draft.background(i), suspect, share, keys[i])
             changed |= self._moved(draft, i, track)
