@@ -327,7 +327,7 @@ class Planner(Stage):
         graph = task.current
         scene, T_table_base = Scene.of(graph, self._stances), inverse(graph.T_base_table)
         objects = {item.name: (self._catalogue[item.label], item.T_base_object) for item in graph.objects}
-        table = replace(self._robot.table, height=float(graph.T_base_table[2, 3]))
+        table = self._robot.table.seen(graph.T_base_table, graph.support)
         for name, (box, T) in self._unknown_objects(graph, objects, self._robot, table).items():
             scene = scene.after(name, Standing.at(name, Stances(box), T_table_base @ T), TABLE)
         return scene

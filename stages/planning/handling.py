@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class Handling:
         objects = {
             name: (item.stance.item, scene.T_base_table @ item.T_table_object) for name, item in scene.standing.items()
         }
-        table = replace(self._table, height=float(scene.T_base_table[2, 3]))
+        table = self._table.seen(scene.T_base_table, scene.surface)
         world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=MARGINS[-1].clearance)
         targets = np.stack([scene.T_base_table @ place.T_table_object for place in places])
         faces = step.item in self._faced

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 BUILT_IN = Path(__file__).parent / "fetch.yaml"
 """The robot of graphs that name none."""
+_LARGER = 0.15
+"""Metres by which a table may reach further than it is declared: the robot stands somewhere, too."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,20 @@ class Table:
     size: tuple[float, float]
     height: float
     thickness: float = 0.04
+
+    def seen(self, T_base_table: Floats, surface: Floats | None) -> Table:
+        """The table as it was perceived: at the height of its frame (4 x 4), and at least as large as it is declared.
+
+        ``surface``: corners as far as they were seen, K x 2, in the table's frame; None where nobody knows.
+        """
+        center, half = np.array(self.center), np.array(self.size) / 2
+        low, high = center - half, center + half
+        if surface is not None:
+            corners = surface @ T_base_table[:2, :2].T + T_base_table[:2, 3]
+            low = np.clip(corners.min(0), low - _LARGER, low)
+            high = np.clip(corners.max(0), high, high + _LARGER)
+        (x, y), (width, depth) = ((low + high) / 2).tolist(), (high - low).tolist()
+        return replace(self, center=(x, y), size=(width, depth), height=float(T_base_table[2, 3]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -496,7 +496,7 @@ def test_what_somebody_puts_in_the_way_home_is_felt_and_another_way_is_found() -
         hand.append(bench.simulation.hand()[:2])
         if len(hand) == 3:
             ahead = (hand[2] - hand[1]) / np.linalg.norm(hand[2] - hand[1])
-            bench.simulation.place("milk_carton", standing("milk_carton", *(hand[2] + 0.1 * ahead)), settle=0.0)
+            bench.simulation.place("milk_carton", standing("milk_carton", *(hand[2] + 0.12 * ahead)), settle=0.0)
 
     bench.meddle = bar
     touched = bench.since(lambda: bench.touched("milk_carton"))

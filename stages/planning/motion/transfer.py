@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
@@ -121,7 +120,7 @@ class TransferRoutine:
         log: Callable[[str], None],
     ) -> None:
         self._request, self._robot, self._rng, self._attempts, self._log = request, robot, rng, attempts, log
-        self._table = dataclasses.replace(table, height=float(request.scene.T_base_table[2, 3]))
+        self._table = table.seen(request.scene.T_base_table, request.scene.support)
         objects = {o.name: (catalogue[o.label], o.T_base_object) for o in request.scene.objects}
         self._objects = objects | unknown_objects(request.scene, objects, robot, self._table)
         self._tally = _Tally()
@@ -407,7 +406,9 @@ class TransferRoutine:
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
-        yield from self._do("go home", path, guard=Guard(force=_BUMP))
+        # Whatever was touched may still be: away from it slowly, and it does not matter if it rubs.
+        speed, force = (SLOW, RUB) if rise else (FAST, _BUMP)
+        yield from self._do("go home", path, speed=speed, guard=Guard(force=force))
         self._under_way = None
         return "", ""
 
