@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 BUILT_IN = Path(__file__).parent / "fetch.yaml"
 """The robot of graphs that name none."""
+BESIDE = 0.08
+"""Metres by which a table may reach further to the sides than is known of it."""
 _LARGER = 0.15
 """Metres by which a table may reach further than it is declared: the robot stands somewhere, too."""
 
@@ -38,7 +40,8 @@ class Table:
     thickness: float = 0.04
 
     def seen(self, T_base_table: Floats, surface: Floats | None) -> Table:
-        """The table as it was perceived: at the height of its frame (4 x 4), and at least as large as it is declared.
+        """The table as it was perceived: at the height of its frame (4 x 4), and at least as large as it is declared;
+        to the sides larger, for there the picture may end before the table does.
 
         ``surface``: corners as far as they were seen, K x 2, in the table's frame; None where nobody knows.
         """
@@ -48,6 +51,7 @@ class Table:
             corners = surface @ T_base_table[:2, :2].T + T_base_table[:2, 3]
             low = np.clip(corners.min(0), low - _LARGER, low)
             high = np.clip(corners.max(0), high, high + _LARGER)
+        low[1], high[1] = low[1] - BESIDE, high[1] + BESIDE
         (x, y), (width, depth) = ((low + high) / 2).tolist(), (high - low).tolist()
         return replace(self, center=(x, y), size=(width, depth), height=float(T_base_table[2, 3]))
 

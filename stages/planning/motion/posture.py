@@ -24,7 +24,7 @@ from stages.planning.motion.motion import (
     robot_command,
     solve_ik,
 )
-from stages.robots import Robot
+from stages.robots import BESIDE, Robot
 from stages.scene.catalogue import Primitive
 
 _ABOVE = (0.10, 0.50)
@@ -40,7 +40,7 @@ _DRAWS = 60
 _CLEARANCE = 0.002
 """Metres that motions keep from everything; postures keep more, so that the arm that is a little off can leave them."""
 _AROUND = 0.03
-"""Metres by which the table may reach further than it is declared, to all sides and down."""
+"""Metres by which the table may reach further than it is declared, to the front, to the back and down."""
 _BUMP = 7.0
 """Newtons at the hand that are a touch."""
 
@@ -55,7 +55,7 @@ def world_of(robot: Robot, request: PostureRequest, *, clearance: float = AMPLE)
     table = replace(
         declared,
         height=request.table_height,
-        size=(width + 2 * _AROUND, depth + 2 * _AROUND),
+        size=(width + 2 * _AROUND, depth + 2 * BESIDE),
         thickness=declared.thickness + 2 * _AROUND,
     )
     boxes = tuple(

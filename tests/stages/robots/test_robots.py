@@ -13,7 +13,7 @@ from stages.devices.check_robot import report
 from stages.geometry.camera import project
 from stages.geometry.poses import exp_so3, inverse, pose
 from stages.planning.motion.collision import CollisionWorld
-from stages.robots import Robot, Table, read_robot
+from stages.robots import BESIDE, Robot, Table, read_robot
 
 HERE = Path(__file__).parent
 FOLDER = Path(stages.robots.__file__).parent
@@ -167,19 +167,19 @@ def test_no_source_names_a_robot() -> None:
     assert named == ['robots/robot.py: BUILT_IN = Path(__file__).parent / "fetch.yaml"']
 
 
-def test_a_table_reaches_as_far_as_it_is_seen() -> None:
+def test_a_table_reaches_as_far_as_it_is_seen_and_further_to_the_sides() -> None:
     declared = Table(center=(0.8, 0.0), size=(0.7, 1.2), height=0.7)
     T_base_table = pose(exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.array([0.8, 0.1, 0.73]))
     corners = np.array([[-0.8, -0.1], [0.5, -0.1], [0.5, 0.39], [-0.8, 0.39]])
     # In the base frame from (0.41, -0.7) to (0.9, 0.6).
     seen = declared.seen(T_base_table, corners)
-    assert (*seen.center, *seen.size) == pytest.approx((0.78, -0.05, 0.74, 1.3))
+    assert (*seen.center, *seen.size) == pytest.approx((0.78, -0.05, 0.74, 1.3 + 2 * BESIDE))
     assert (seen.height, seen.thickness) == (pytest.approx(0.73), declared.thickness)
 
 
-def test_a_table_of_which_less_is_seen_is_as_it_is_declared() -> None:
+def test_a_table_of_which_less_is_seen_reaches_as_far_as_it_is_declared() -> None:
     declared = Table(center=(0.8, 0.0), size=(0.7, 1.2), height=0.7)
     T_base_table = pose(np.eye(3), np.array([0.8, 0.0, 0.68]))
     for corners in (None, 0.1 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])):
         seen = declared.seen(T_base_table, corners)
-        assert (*seen.center, *seen.size, seen.height) == pytest.approx((0.8, 0.0, 0.7, 1.2, 0.68))
+        assert (*seen.center, *seen.size, seen.height) == pytest.approx((0.8, 0.0, 0.7, 1.2 + 2 * BESIDE, 0.68))
