@@ -396,7 +396,9 @@ class Targets:
         """
         if destination == TABLE:
             T_base_object = scene.T_base_table @ item.T_table_object
-            within_reach = self._workspace.outside(T_base_object) == 0 and self._beyond_reach(T_base_object) < FARTHER
+            within_reach = (
+                self._workspace.outside(T_base_object) == 0 and self._robot.beyond_reach(T_base_object) < FARTHER
+            )
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         surface = carrier.floor if carrier.stance.cavity else carrier.top
@@ -405,10 +407,6 @@ class Targets:
         middles = np.stack([regions.centroid(item.bottom), regions.centroid(surface)])
         depth, deepest = regions.depth(surface, middles)
         return bool(depth >= min(MIDDLE, 0.5 * deepest))
-
-    def _beyond_reach(self, T_base_object: Floats) -> float:
-        distance = float(np.hypot(*(T_base_object[:2, 3] - self._robot.shoulder)))
-        return max(0.0, distance - self._robot.reach)
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
@@ -438,7 +436,7 @@ class Targets:
                 continue
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
             crowded = max(0.0, self._workspace.spacing - min(room, free))
-            far = self._beyond_reach(scene.T_base_table @ spot.T_table_object)
+            far = self._robot.beyond_reach(scene.T_base_table @ spot.T_table_object)
             spots.append(Placement(spot, 0.2 * distance + 2 * (crowded + far) + _hidden(spot, others, scene)))
         spots = sorted(spots, key=lambda placement: placement.cost)[: 2 * self._workspace.targets]
         if step.item in self._turned:

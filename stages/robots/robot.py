@@ -180,6 +180,10 @@ class Robot:
 
         return Body(self.specification())
 
+    def beyond_reach(self, T_base_object: Floats) -> float:
+        """How far an object's pose is out of :attr:`reach`, metres; 0 within."""
+        return max(0.0, float(np.linalg.norm(T_base_object[:2, 3] - self.shoulder)) - self.reach)
+
     def camera_pose(self, joint_names: Sequence[str], positions: Floats) -> Floats:
         """T_base_camera (4 x 4) of the camera's optical frame; joints that are not named are at zero."""
         camera = self.camera

@@ -202,7 +202,7 @@ class Draft:
 
     def _is_carried(self, item: Standing, support: str) -> bool:
         """Wholly over the table or a hollow's floor, by its middle on a top; and not far beyond the robot's reach."""
-        if np.linalg.norm(item.T_table_stance[:2, 3] - self._robot.shoulder) > self._robot.reach + _BEYOND:
+        if self._robot.beyond_reach(item.T_table_stance) > _BEYOND:
             return False
         surface = self._surface_of(support)
         if support == TABLE:

@@ -316,8 +316,7 @@ def _is_seen(layout: Layout, catalogue: Catalogue, robot: Robot) -> bool:
 
 def _reachable(T: Floats, robot: Robot, slack: float = 0.0) -> bool:
     x = T[0, 3] - shift(robot)[0]
-    near = np.linalg.norm(T[:2, 3] - robot.shoulder) <= robot.reach + slack
-    return bool(near and _NEAR - slack <= x <= _FAR + slack)
+    return bool(robot.beyond_reach(T) <= slack and _NEAR - slack <= x <= _FAR + slack)
 
 
 def _gap(a: str, b: str, layout: Layout, catalogue: Catalogue) -> float:

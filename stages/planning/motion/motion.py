@@ -183,6 +183,12 @@ def robot_command(
     )
 
 
+def way_back(robot: Robot, waypoints: Floats, state: RobotState) -> RobotCommand:
+    """Has the empty hand go back the way (W x J) on which it was stopped, which was free."""
+    _, back = back_along(densify(waypoints), arm(robot, state))
+    return robot_command(robot, "go back the way it came", back, speed=SLOW, guard=Guard(force=RUB))
+
+
 def arm(robot: Robot, state: RobotState) -> Floats:
     """Positions (J) of the joints that planning moves."""
     where = dict(zip(state.joint_names, state.positions, strict=True))

@@ -13,17 +13,7 @@ from stages.geometry.poses import pose, random_rotations
 from stages.messages import Arrived, Outcome, PostureRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.planning.motion.collision import AMPLE, CollisionWorld
-from stages.planning.motion.motion import (
-    RUB,
-    SLOW,
-    arm,
-    back_along,
-    densify,
-    free_motion,
-    restarts,
-    robot_command,
-    solve_ik,
-)
+from stages.planning.motion.motion import arm, free_motion, restarts, robot_command, solve_ik, way_back
 from stages.robots import BESIDE, Robot
 from stages.scene.catalogue import Primitive
 
@@ -119,10 +109,7 @@ class PostureRoutine:
             self._log(f"{self._request.label}: {reason}")
         stopped = state.stopped
         if path is not None and stopped == "touch":
-            _, back = back_along(densify(path), arm(self._robot, state))
-            state = yield robot_command(
-                self._robot, "go back the way it came", back, speed=SLOW, guard=Guard(force=RUB)
-            )
+            state = yield way_back(self._robot, path, state)
         return Arrived(
             success=not reason,
             reason=reason,

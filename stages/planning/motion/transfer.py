@@ -25,6 +25,7 @@ from stages.planning.motion.motion import (
     free_motion,
     robot_command,
     straight_motion,
+    way_back,
 )
 from stages.planning.motion.pick_place import (
     LIFT,
@@ -179,8 +180,7 @@ class TransferRoutine:
         """The empty hand goes back the way that it came, which was free."""
         if broken.waypoints is None:
             return broken.state
-        _, back = back_along(densify(broken.waypoints), self._arm(broken.state))
-        return (yield from self._do("go back the way it came", back, speed=SLOW, guard=Guard(force=RUB)))
+        return (yield from self._carry_out(way_back(self._robot, broken.waypoints, broken.state)))
 
     def _stands(self, broken: _BrokenOff) -> tuple[FailedStage, str]:
         """The arm stays where it is."""
@@ -454,15 +454,22 @@ class TransferRoutine:
         width: float | None = None,
         guard: Guard | None = None,
     ) -> Generator[RobotCommand, RobotState, RobotState]:
-        """Has one command carried out.
+        """Has a motion, or one of the fingers, carried out; free motions can be gone back along."""
+        command = robot_command(self._robot, label, waypoints, speed=speed, width=width, guard=guard)
+        return (yield from self._carry_out(command, waypoints if speed == FAST else None))
+
+    def _carry_out(
+        self, command: RobotCommand, free: Floats | None = None
+    ) -> Generator[RobotCommand, RobotState, RobotState]:
+        """Has one command carried out, along ``free`` waypoints (W x J) if they are.
 
         Raises:
             _BrokenOff: it was stopped on the way.
         """
-        state = yield robot_command(self._robot, label, waypoints, speed=speed, width=width, guard=guard)
+        state = yield command
         self._tally.clock = state.time
         if state.stopped:
-            raise _BrokenOff(state, label, waypoints if speed == FAST else None)
+            raise _BrokenOff(state, command.label, free)
         return state
 
     def _outcome(self, failed_stage: FailedStage, reason: str) -> Outcome:
