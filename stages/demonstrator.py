@@ -128,6 +128,8 @@ class State:
     """Somebody asked to stop: what is waited for is the last."""
     halted: bool = False
     """The arm stands where it was stopped."""
+    astray: str = ""
+    """Why the arm did not get to where the camera looks from; empty where it did."""
     ask: bool = False
     """Somebody is there to be asked what a look leaves open."""
     asked: int = 0
@@ -396,7 +398,8 @@ class Demonstrator(Stage):
         return self._look(f"after transfer {outcome.number}")
 
     def on_arrived(self, arrived: Arrived, ctx: Context) -> Verdict | None:
-        """The arm shows itself before a look is taken; who stops it then wants no look."""
+        """The arm shows itself and brings the camera to where it looks from; who stops it then wants no look."""
+        self._state = replace(self._state, astray="" if arrived.success else arrived.reason)
         if arrived.stopped != STOPPED or self._state.phase is not Phase.LOOKING:
             return None
         self._state = replace(self._state, halted=True)
@@ -424,9 +427,15 @@ class Demonstrator(Stage):
         if self._state.phase is not Phase.IDLE:
             raise Refused(f"busy: waits for {self._state.phase.value}; ask again after the verdict")
         waits = "asked" if ask and goal is not None else ""
-        state = self._state
         self._state = State(
-            goals=state.goals, goal_name=name, goal=goal, halted=state.halted, ask=ask, asked=state.asked, waits=waits
+            goals=self._state.goals,
+            goal_name=name,
+            goal=goal,
+            halted=self._state.halted,
+            astray=self._state.astray,
+            ask=ask,
+            asked=self._state.asked,
+            waits=waits,
         )
 
     def _first_look(self, purpose: str) -> LookRequest | Recover:
@@ -511,6 +520,8 @@ class Demonstrator(Stage):
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""
         if self._state.goal is None:
+            if self._state.astray:
+                return f"the camera is not where it looks from: {self._state.astray}"
             wanted = 0 if self._config.n_objects == "auto" else self._config.n_objects
             if len(scene.objects) < wanted:
                 return f"{len(scene.objects)} of {wanted} objects seen"

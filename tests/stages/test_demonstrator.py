@@ -855,3 +855,20 @@ def test_whoever_stops_the_arm_while_it_shows_itself_wants_no_look() -> None:
     verdict = episode.stage.on_arrived(stopped, episode.ctx)
     assert verdict is not None and (verdict.failed_stage, verdict.reason) == (STOPPED, stopped.reason)
     assert episode.called(Look()) == [Recover()]
+
+
+def test_a_goal_is_taught_only_from_where_the_camera_looks_from() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    touched = Arrived(success=False, reason="touched", joint_names=(), positions=np.zeros(0), robot_seconds=1.0)
+    episode.stage.on_arrived(touched, episode.ctx)
+    (again,) = episode.seen(GOAL)
+    assert isinstance(again, LookRequest)
+    assert any("not where it looks from: touched; looking again" in line for line in episode.ctx.lines)
+    episode.seen(GOAL)
+    verdict = the_verdict(episode.seen(GOAL))
+    assert "not where it looks from: touched" in verdict.reason
+    episode.called(Teach(name="tea"))
+    assert isinstance(episode.seen(GOAL)[0], LookRequest)
+    episode.stage.on_arrived(msgspec.structs.replace(touched, success=True, reason=""), episode.ctx)
+    assert isinstance(episode.seen(GOAL)[0], Goal)
