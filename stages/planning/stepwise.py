@@ -32,13 +32,15 @@ def stepwise(
 ) -> list[tuple[Step, Floats]] | None:
     """Steps with their T_base_targets, N x 4 x 4 each; None where no order leads to the goal.
 
-    Transfers with ``avoided`` keys failed before and get other targets.
+    Transfers with ``avoided`` keys failed before and get other targets. Where an order does not lead there as
+    things stand, what belongs beside something is put aside, and what it belongs beside goes to where it was shown.
     """
     order = list(problem.items)
     for _ in range(_STARTS):
-        way = _Way(Moves(problem, order), problem, targets, scene, avoided)
-        if way.leads_home():
-            return way.steps
+        for attempt, apart in ((problem, ()), (problem.laid_out_anew(), problem.regions)):
+            way = _Way(Moves(attempt, order), attempt, targets, scene, avoided)
+            if way.leads_home(apart):
+                return way.steps
         rng.shuffle(order)
     return None
 
@@ -92,11 +94,14 @@ class _Way:
         self._waits: dict[str, str] = {}
         """What was put aside -> the object for which it was."""
 
-    def leads_home(self) -> bool:
-        """Goes on until the goal is reached, or nothing can be moved any more."""
+    def leads_home(self, apart: Iterable[str]) -> bool:
+        """Goes on until the goal is reached, or nothing can be moved any more; before that, ``apart`` are put aside."""
+        for name in apart:
+            while self._put_aside([(name, name)]) and name not in self._asides:
+                pass
         while not self._moves.reached(self._state):
             blocked = self._go_home()
-            if blocked is not None and not self._put_aside(blocked):
+            if blocked is not None and not self._put_aside(self._hindering(blocked)):
                 return False
         return True
 
@@ -115,11 +120,14 @@ class _Way:
                     blocked.append(found)
         return blocked
 
-    def _put_aside(self, blocked: Sequence[Blocked]) -> bool:
-        """Puts the first object aside that can be: what is in the way, what is in the way of that, what must move."""
-        pending = self._moves.pending(self._state)
+    def _hindering(self, blocked: Sequence[Blocked]) -> list[tuple[str, str]]:
+        """What is in the way, and of which object; then what must move."""
         ahead = [(name, one.step.item) for one in blocked for name in self._in_the_way(one)]
-        ahead += [(name, name) for name in pending]
+        return ahead + [(name, name) for name in self._moves.pending(self._state)]
+
+    def _put_aside(self, ahead: list[tuple[str, str]]) -> bool:
+        """Puts the first object aside that can be, or what is in the way of that; ``ahead`` also says for which."""
+        pending = self._moves.pending(self._state)
         tried: set[str] = set()
         while ahead:
             below, other = ahead.pop(0)

@@ -341,6 +341,35 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
 
 
+@pytest.mark.slow
+def test_what_others_belong_beside_goes_to_where_it_was_shown_if_they_have_no_room_elsewhere():
+    """Three objects stand around a sponge, all of its sides taken; now it lies at the table's edge, and a bottle where
+    it was."""
+    goal = (
+        Layout()
+        .put("milk_carton", 0.151, -0.030, yaw=2.49)
+        .put("sponge", 0.041, 0.013, yaw=-2.74)
+        .put("sauce_bottle", 0.060, 0.183, yaw=-2.78)
+        .put("tea_box", -0.063, 0.066, yaw=1.16)
+        .put("soup_can", 0.130, 0.102, yaw=2.86)
+        .put("sugar_box", 0.0, 0.0, yaw=1.69, on="soup_can")
+    )
+    start = (
+        Layout()
+        .put("sponge", -0.021, -0.033, yaw=-2.77)
+        .put("tea_box", 0.120, -0.092, yaw=-1.66)
+        .put("milk_carton", 0.008, 0.216, yaw=1.91)
+        .put("sauce_bottle", -0.002, 0.080, yaw=-1.66)
+        .put("soup_can", 0.079, 0.115, yaw=0.69)
+        .put("sugar_box", 0.0, 0.0, yaw=-0.13, on="soup_can")
+        .put("bowl", 0.069, 0.336)
+    )
+    found = plan(goal, start, surface=np.array([[-0.15, -0.42], [0.5, -0.6], [0.5, 0.6], [-0.15, 0.44]]))
+    after = executed(start, found)
+    assert found.status == "solved", found.reason
+    assert reached(goal, after) and penetrations(after) == []
+
+
 def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere():
     """A tower turned over: its lowest box belongs right beside the sponge that goes onto it next."""
     goal = Layout().put("sugar_box", 0.05, 0.09, yaw=0.3).put("sponge", 0, 0, on="sugar_box")

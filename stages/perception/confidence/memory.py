@@ -16,19 +16,20 @@ from stages.perception.hypotheses.unexplained import is_contradicted, looked_thr
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import SURE
+from stages.scene.doubts import SURE, is_below
 from stages.scene.naming import Named, names_kept, unique_names
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
 
 _TRIANGLES = 500
 _CLEARER = 2.0
 """How many times as much must show of what is seen now, but not surely, as showed of what was seen before in its
-place; of what is surely seen it is enough that no less shows."""
+place; of what is surely seen it is enough that no less shows, or that what was seen before was in doubt."""
 _SAME = 0.02
 """Metres within which a doubtful pose and a sure one from before may be one: as far off as a pose is that counts as
 right."""
 _THROUGH = 0.01
-"""Metres by which an object that is remembered must reach into a surer one that is seen to be no more there."""
+"""Metres by which an object that is remembered must reach into a surer one that is seen to be no more there, and by
+which the heights of two overlap that do not stand on each other."""
 _CONTENT = 0.5
 """Share of a container's footprint up to which something may stand in it wherever its floor is."""
 _BESIDE = 0.005
@@ -125,8 +126,8 @@ class Memory:
         return inverse_depth(shape.soup, inverse(observation.T_base_camera) @ item.T_base_object, view.view)
 
     def _overlap(self, item: SceneObject, stranger: SceneObject, scene: SceneGraph, depth: float = 0.0) -> bool:
-        """Whether not both can stand there, by more than ``depth`` metres; what is small beside a container, or stands
-        on its floor, may be in it."""
+        """Whether not both can stand there, by more than ``depth`` metres across; one may stand on the other, and what
+        is small beside a container, or stands on its floor, may be in it."""
         a, b = standing_of((item, stranger), self._stances, scene.T_base_table)
         areas = [regions.area(one.outline) for one in (a, b)]
         outer, inner = (a, b) if areas[0] > areas[1] else (b, a)
@@ -134,8 +135,8 @@ class Memory:
         fits &= regions.inside(inner.outline, outer.outline, margin=_WALL)
         if outer.stance.cavity and (fits or min(areas) < _CONTENT * max(areas)):
             return False
-        level = a.z_bottom < b.z_top and b.z_bottom < a.z_top
-        return level and regions.separation(a.outline, b.outline) < -depth
+        upwards = min(a.z_top, b.z_top) - max(a.z_bottom, b.z_bottom)
+        return upwards > _THROUGH and regions.separation(a.outline, b.outline) < -depth
 
     def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
         """The same scene with other objects: what carries what is found anew, regions stay where both objects do."""
@@ -163,5 +164,5 @@ def _surer(item: SceneObject, other: SceneObject) -> bool:
 def _clearer(stranger: SceneObject, before: SceneObject) -> bool:
     """Whether what is seen now is believed rather than what was seen before in its place."""
     if stranger.probability is not None and stranger.probability >= SURE:
-        return stranger.visible >= before.visible
+        return is_below(before, SURE) or stranger.visible >= before.visible
     return stranger.visible > _CLEARER * before.visible

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from stages.messages.scene import SceneGraph
 from stages.scene.facing import sides
@@ -97,6 +97,12 @@ class Problem:
         while item in self.regions:
             item = self.regions[item].parent
             yield item
+
+    def laid_out_anew(self) -> Problem:
+        """The problem in which what others belong beside moves before they are placed: to where it was shown, at best,
+        for there all of them had room."""
+        moved = {(one.parent, one.child, one.name) for one in self.regions.values() if one.parent in self.graspable}
+        return replace(self, obstructions=self.obstructions | moved)
 
     def satisfied(self) -> bool:
         """Whether the goal holds already."""

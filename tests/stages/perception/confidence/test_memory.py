@@ -87,19 +87,43 @@ def test_what_was_taken_for_a_stranger_is_what_stood_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("visible", "probability", "believed"),
-    [(0.2, None, True), (0.8, None, False), (0.8, 0.95, True), (0.8, 0.5, False), (1.0, 0.95, False)],
+    ("visible", "probability", "before", "believed"),
+    [
+        (0.2, None, None, True),
+        (0.8, None, None, False),
+        (0.8, 0.95, None, True),
+        (0.8, 0.5, None, False),
+        (1.0, 0.95, None, False),
+        (1.0, 0.95, 0.99, False),
+        (1.0, 0.95, 0.88, True),
+    ],
 )
-def test_a_stranger_of_which_more_shows_is_believed(visible: float, probability: float | None, believed: bool) -> None:
+def test_a_stranger_of_which_more_shows_or_that_is_surer_is_believed(
+    visible: float, probability: float | None, before: float | None, believed: bool
+) -> None:
     """A can that was called a salt shaker while a carton hid some of it."""
     can = {"soup_can": upright("soup_can", 0.06, 0.05, 0.0)}
-    before = msgspec.structs.replace(known({"salt_shaker": HALF_BEHIND})["salt_shaker"], visible=visible)
+    shaker = known({"salt_shaker": HALF_BEHIND})["salt_shaker"]
+    shaker = msgspec.structs.replace(shaker, visible=visible, probability=before)
     (now,) = graph(can).objects
     seen = msgspec.structs.replace(
         graph(can), objects=(msgspec.structs.replace(now, visible=0.9, probability=probability),)
     )
-    scene = MEMORY.complete(seen, {"salt_shaker": before}, observation(can))
+    scene = MEMORY.complete(seen, {"salt_shaker": shaker}, observation(can))
     assert names(scene) == ["soup_can" if believed else "salt_shaker"]
+
+
+def test_what_stands_on_a_box_does_not_say_that_there_is_none() -> None:
+    """Of a box under a sponge so little shows that it is taken for a can; the sponge is seen a millimetre too low."""
+    layout = Layout().put("tea_box", 0.0, 0.0).put("sponge", 0.0, 0.0, on="tea_box")
+    box = msgspec.structs.replace(known(layout.poses)["tea_box"], probability=0.995, visible=1.0)
+    low = layout.poses["sponge"].copy()
+    low[2, 3] -= 0.001
+    sponge, can = graph({"sponge": low, "soup_can": upright("soup_can", 0.0, 0.0, 0.0)}).objects
+    sponge = msgspec.structs.replace(sponge, probability=0.998)
+    can = msgspec.structs.replace(can, probability=0.97, visible=0.26)
+    seen = msgspec.structs.replace(graph({"sponge": low}), objects=(sponge, can))
+    assert names(MEMORY.complete(seen, {"tea_box": box}, observation(layout.poses))) == ["sponge", "tea_box"]
 
 
 def test_a_stranger_elsewhere_is_kept() -> None:
