@@ -61,6 +61,7 @@ from stages.scene.virtual import satisfied, without
 _EXCHANGES = 200
 """Ways to name equal objects that are compared."""
 _WRONG_SIDE = "is not seen to show the side that it should"
+_UNKNOWN = "something is there that no object explains"
 
 
 class Phase(Enum):
@@ -340,6 +341,8 @@ class Demonstrator(Stage):
             yield self._look_for(missing, scene, ctx)
         elif self._state.goal is None and (doubtful := self._doubtful(scene, SURE)):
             yield self._look_again("perception", f"in doubt: {', '.join(doubtful)}", ctx)
+        elif self._state.goal is None and scene.unknown and self._may_see_more() and not self._state.ask:
+            yield self._look_again("perception", _UNKNOWN, ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
         else:
@@ -538,15 +541,19 @@ class Demonstrator(Stage):
 
     def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
         """Objects whose pose is less probable than that, while there is a look left to see them better."""
-        if self._state.repeats == self._config.repeats:
-            return []
-        return [item.name for item in scene.objects if is_below(item, least)]
+        return [item.name for item in scene.objects if is_below(item, least)] if self._may_see_more() else []
+
+    def _may_see_more(self) -> bool:
+        """Whether there is a look left at the same scene."""
+        return self._state.repeats < self._config.repeats
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
         unsure = [
             f"{item.name} ({100 * (item.probability or 0):.0f} %)" for item in scene.objects if is_below(item, SURE)
         ]
+        if scene.unknown:
+            unsure.append(_UNKNOWN)
         if unsure:
             looks = self._state.repeats + 1
             ctx.log(

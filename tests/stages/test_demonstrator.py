@@ -34,7 +34,7 @@ from stages.messages import (
     TransferRequest,
     Verdict,
 )
-from stages.messages.scene import Doubt, SceneObject
+from stages.messages.scene import Doubt, SceneObject, UnknownRegion
 from stages.messages.task import STOPPED
 from stages.robots import BUILT_IN
 from stages.scene.facing import faced, sides, turned_to
@@ -686,6 +686,23 @@ def test_a_goal_that_is_in_doubt_is_looked_at_again_before_it_is_remembered() ->
     assert isinstance(goal, Goal)  # with what there is, after as many looks as are taken
     said = ", ".join(f"{one.name} (20 %)" for one in GOAL.objects)
     assert f"still in doubt after 3 looks, remembered all the same: {said}" in episode.ctx.lines
+
+
+def test_a_goal_with_something_unknown_is_looked_at_again_before_it_is_remembered() -> None:
+    region = UnknownRegion(box=np.zeros(4), points=90, centre_table=np.zeros(3), extent_table=np.ones(3))
+    open_goal = msgspec.structs.replace(GOAL, unknown=(region,))
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    assert episode.seen(open_goal) == [LookRequest(purpose="goal tea, look 2")]
+    assert isinstance(episode.seen(GOAL)[0], Goal)
+    episode.called(Teach(name="tea"))
+    episode.seen(open_goal)
+    episode.seen(open_goal)
+    (goal,) = episode.seen(open_goal)
+    assert isinstance(goal, Goal)
+    assert any("remembered all the same: something is there that no object" in line for line in episode.ctx.lines)
+    episode.called(Teach(name="tea", ask=True))
+    assert isinstance(episode.seen(open_goal)[0], Goal)  # Somebody is there, and was asked about it if need be.
 
 
 @pytest.mark.parametrize("probability", [0.6, 0.95])
