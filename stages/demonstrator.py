@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -629,8 +630,8 @@ class Demonstrator(Stage):
         self._state = replace(state, transfer=None, complaint=complaint)
 
     def _avoided(self) -> tuple[str, ...]:
-        failures = self._state.failures
-        return tuple(sorted({key for key in failures if failures.count(key) >= self._config.tries}))
+        counts = Counter(self._state.failures)
+        return tuple(sorted(key for key in counts for _ in range(counts[key] // self._config.tries)))
 
     def _wait(self, plan: Plan, ctx: Context) -> None:
         self._state = replace(self._state, phase=Phase.READY, plan=plan)

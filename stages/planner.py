@@ -19,7 +19,7 @@ from stages.geometry.poses import inverse
 from stages.messages import Assertion, Plan, SceneGraph, Task, Transfer
 from stages.planning.places.hiding import uncovers
 from stages.planning.places.placements import Placements, Scene
-from stages.planning.stepwise import shortened, stepwise
+from stages.planning.stepwise import hopeless, shortened, stepwise
 from stages.planning.symbolic import search
 from stages.planning.symbolic.pddl import problem_pddl
 from stages.planning.symbolic.problem import TABLE, Problem, cycle, wanted
@@ -54,7 +54,7 @@ class Attempt:
     problem: Problem
     reluctant: frozenset[str]
     regrasped: frozenset[str] = frozenset()
-    """What is laid on another side first, for the hand cannot turn it at once."""
+    """What is put aside first: the hand cannot turn it at once, or has failed with it again and again."""
 
     def steps(self, found: Sequence[Step]) -> tuple[Step, ...]:
         """What the search found, with a step more for what is regrasped, unless it is put aside anyway."""
@@ -281,7 +281,8 @@ class Planner(Stage):
                 raise Impossible(_no_room(Blocked(step, (), handled.why_not()[0])))
 
     def _solve_with_room(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
-        """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be."""
+        """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be; one
+        that failed in other places, too, is made by way of a place aside."""
         scene = self._scene(task)
         beside = {
             (neighbour, item, destination)
@@ -289,16 +290,19 @@ class Planner(Stage):
             for neighbour in neighbours(item, scene)[:1]
             if neighbour in problem.graspable
         }
-        if beside:
+        detours = frozenset(_moved(key)[0] for key in hopeless(task.avoid))
+        roomy = replace(problem, obstructions=problem.obstructions | beside)
+        for one in (*([roomy] if beside else ()), *([problem] if detours else ())):
             with suppress(Impossible):
-                return self._solve(replace(problem, obstructions=problem.obstructions | beside), task, taught, ctx)
-        return self._solve(problem, task, taught, ctx)
+                return self._solve(one, detours, task, taught, ctx)
+        return self._solve(problem, frozenset(), task, taught, ctx)
 
-    def _solve(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
-        """Searches, finds poses, and searches again with what was in the way, until every transfer has poses."""
+    def _solve(self, problem: Problem, detours: frozenset[str], task: Task, taught: SceneGraph, ctx: Context) -> Plan:
+        """Searches, finds poses, and searches again with what was in the way, until every transfer has poses; what has
+        to make ``detours`` is put aside first."""
         current, targets = self._scene(task), self._targets(problem, task, taught, ctx)
         blocked: Blocked | None = None
-        attempt = Attempt(problem, frozenset(_moved(key)[0] for key in task.avoid))
+        attempt = Attempt(problem, frozenset(_moved(key)[0] for key in task.avoid), detours)
         for number in range(1, SEARCHES + 1):
             text = problem_pddl(task.goal_name, attempt.problem, task.current, task.goal)
             solution = self._search(attempt, text)
@@ -312,7 +316,9 @@ class Planner(Stage):
                 continue
             if not isinstance(poses, Blocked):
                 steps = zip(found, poses, strict=True)
-                if attempt.problem != problem or attempt.regrasped:  # What was thought to be in the way need not be.
+                if (
+                    attempt.problem != problem or attempt.regrasped != detours
+                ):  # What was thought to be in the way need not be.
                     steps = shortened(steps, problem, targets, current, avoided=task.avoid)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, found)

@@ -41,7 +41,8 @@ class Task(Message, frozen=True, kw_only=True):
     goal: SceneGraph
     current: SceneGraph
     avoid: tuple[str, ...] = ()
-    """Transfers that failed and should not be tried the same way again (``Transfer.key``)."""
+    """Transfers that failed and should not be tried the same way again (``Transfer.key``); one that failed in other
+    places, too, more than once."""
     aside: str = ""
     """An object to be put elsewhere first, to see what it hides; nothing else is asked for then."""
     then: tuple[str, ...] = ()

@@ -10,7 +10,7 @@ than they need be even without them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ _ASIDE = 2
 
 
 def stepwise(
-    problem: Problem, targets: Targets, scene: Scene, rng: np.random.Generator, *, avoided: Collection[str] = ()
+    problem: Problem, targets: Targets, scene: Scene, rng: np.random.Generator, *, avoided: Sequence[str] = ()
 ) -> list[tuple[Step, Floats]] | None:
     """Steps with their T_base_targets, N x 4 x 4 each; None where no order leads to the goal.
 
@@ -51,14 +51,16 @@ def shortened(
     targets: Targets,
     scene: Scene,
     *,
-    avoided: Collection[str] = (),
+    avoided: Sequence[str] = (),
 ) -> list[tuple[Step, Floats]]:
     """Steps with their T_base_targets, without those that the others can do without, at first all of one object's;
     ``avoided`` as above."""
 
+    never = hopeless(avoided)
+
     def placed(fewer: Sequence[Step]) -> list[tuple[Step, Floats]] | None:
         again = [step for step in fewer if step.key in avoided]
-        if not leads_home(fewer, problem):
+        if not leads_home(fewer, problem) or any(step.key in never for step in fewer):
             return None
         poses = targets.of(fewer, scene, again=again, late=problem.items, what="a shorter plan")
         return list(zip(fewer, poses, strict=True)) if isinstance(poses, list) else None
@@ -70,6 +72,11 @@ def shortened(
         fewer = placed(_without([step for step, _ in best], k))
         best, k = (fewer, k) if fewer else (best, k + 1)
     return best
+
+
+def hopeless(avoided: Sequence[str]) -> set[str]:
+    """Of keys of transfers that failed those that occur again: they failed in other places, too."""
+    return {key for key in avoided if avoided.count(key) > 1}
 
 
 def _without(steps: Sequence[Step], k: int) -> list[Step]:
@@ -84,9 +91,7 @@ def _without(steps: Sequence[Step], k: int) -> list[Step]:
 class _Way:
     """One way forward."""
 
-    def __init__(
-        self, moves: Moves, problem: Problem, targets: Targets, scene: Scene, avoided: Collection[str]
-    ) -> None:
+    def __init__(self, moves: Moves, problem: Problem, targets: Targets, scene: Scene, avoided: Sequence[str]) -> None:
         self.steps: list[tuple[Step, Floats]] = []
         self._moves, self._problem, self._targets, self._avoided = moves, problem, targets, avoided
         self._state, self._scene = moves.start, scene

@@ -259,6 +259,11 @@ def test_a_failed_transfer_is_tried_again_then_avoided() -> None:
     episode.ended(2, STEP, failed_stage="grasp", reason="cup slipped")
     (task,) = episode.seen(START)
     assert isinstance(task, Task) and task.avoid == (STEP.key,)
+    for number, avoided in ((3, (STEP.key,)), (4, (STEP.key, STEP.key))):
+        episode.planned(STEP)
+        episode.ended(number, STEP, failed_stage="grasp", reason="cup slipped")
+        (task,) = episode.seen(START)
+        assert isinstance(task, Task) and task.avoid == avoided
 
 
 def test_a_transfer_that_misses_its_relation_counts_as_failed() -> None:

@@ -341,6 +341,14 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
 
 
+def test_a_transfer_that_failed_in_other_places_too_is_made_by_way_of_a_place_aside():
+    start, key = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.05, -0.35), "tea_box: table -> tray"
+    found = plan(crowded_goal(), start, avoid=(key, key))
+    moves = [transfer.key for transfer in found.transfers if transfer.object == "tea_box"]
+    assert moves == ["tea_box: table -> table", key]
+    assert reached(crowded_goal(), executed(start, found))
+
+
 @pytest.mark.slow
 def test_what_others_belong_beside_goes_to_where_it_was_shown_if_they_have_no_room_elsewhere():
     """Three objects stand around a sponge, all of its sides taken; now it lies at the table's edge, and a bottle where

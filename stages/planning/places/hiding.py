@@ -64,16 +64,26 @@ def _hides(name: str, imagined: Standing, scene: Scene) -> bool:
 
 
 def _imagined(missing: Sequence[Stances], scene: Scene) -> Iterator[Standing]:
-    """The missing objects upright at every place of the table, as far as that was seen, where nothing stands."""
+    """The missing objects upright at every place of the table, as far as that was seen, and of the containers on it,
+    where nothing stands."""
     if scene.eye is None or scene.surface is None:
         return
-    on_table = [item for name, item in scene.standing.items() if scene.supports[name] == TABLE]
+    on_table = [name for name, support in scene.supports.items() if support == TABLE]
+    containers = [name for name in on_table if scene.standing[name].stance.cavity]
     (x0, y0), (x1, y1) = scene.surface.min(0), scene.surface.max(0)
     for stances in missing:
         for x in np.arange(x0, x1, _GRID):
             for y in np.arange(y0, y1, _GRID):
                 T = np.eye(4)
                 T[:2, 3] = x, y
-                item = scene.rested(Standing.at("", stances, T), TABLE)
-                if all(regions.separation(item.outline, other.outline) > 0 for other in on_table):
-                    yield item
+                item = Standing.at("", stances, T)
+                for support in (TABLE, *containers):
+                    if _has_room(item, support, scene):
+                        yield scene.rested(item, support)
+
+
+def _has_room(item: Standing, support: str, scene: Scene) -> bool:
+    """Whether a place on the table or in a container is free."""
+    others = [scene.standing[name] for name, below in scene.supports.items() if below == support]
+    within = support == TABLE or regions.inside(item.bottom, scene.standing[support].floor)
+    return within and all(regions.separation(item.outline, other.outline) > 0 for other in others)

@@ -39,6 +39,12 @@ def test_a_box_on_its_end_hides_a_can_in_the_strip_behind_it() -> None:
     assert found == ["cereal_box"]
 
 
+def test_what_stands_in_a_tray_is_looked_behind() -> None:
+    tray = Layout().put("tray", 0.1, 0.0).put("milk_carton", -0.05, 0.0, on="tray")
+    seen = scene(tray, {"tray": TABLE, "milk_carton": "tray"})
+    assert hiders([stances("salt_shaker")], seen, MOVABLE) == ["milk_carton"]
+
+
 def test_what_hangs_in_the_air_is_looked_under_first_and_a_stack_from_its_top() -> None:
     layout = Layout().put("sponge", 0.0, -0.2).put("milk_carton", 0.0, 0.2)
     layout.poses["sponge"] = raised(layout.poses["sponge"], 0.035)
