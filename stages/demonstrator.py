@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.poses import pose
 from stages.messages import (
     Answer,
     Arrangement,
@@ -698,16 +700,18 @@ class Demonstrator(Stage):
         return f"{satisfied(state.goal, state.scene, self._catalogue)[1][0]} does not hold"
 
     def _fallen(self) -> list[str]:
-        """What lies and stands neither as at the start nor as in the goal; upside down nothing falls."""
+        """What lies and stands neither as at the start nor as in the goal, or of what was not seen then, as such things
+        stand; upside down nothing falls."""
         state = self._state
         if state.scene is None or state.first is None or state.goal is None:
             return []
         before = [{item.name: item.T_base_object for item in one.objects} for one in (state.first, state.goal)]
 
         def lies(item: SceneObject) -> bool:
-            poses = [poses[item.name] for poses in before if item.name in poses]
-            angles = [turned(self._catalogue[item.label], item.T_base_object, T) for T in poses]
-            return bool(angles) and all(TIPPED < angle < pi - TIPPED for angle in angles)
+            entry = self._catalogue[item.label]
+            usual = pose(entry.resting[0], np.zeros(3))
+            stood = [poses[item.name] for poses in before if item.name in poses] or [usual]
+            return all(TIPPED < turned(entry, item.T_base_object, T) < pi - TIPPED for T in stood)
 
         return [item.name for item in state.scene.objects if lies(item)]
 

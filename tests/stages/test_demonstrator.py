@@ -53,6 +53,7 @@ BLIND = Observation(
 )  # fmt: skip
 """Shows nothing, not even that a place is empty."""
 LOOK = camera()
+LYING = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 CARTON = Layout({"milk_carton": upright("milk_carton", 0.0, -0.05, 0.0)})
 HIDDEN = upright("salt_shaker", 0.0, 0.04, 0.0)
 OPEN = upright("salt_shaker", 0.15, -0.1, 0.0)
@@ -179,17 +180,28 @@ def test_what_was_knocked_over_is_set_upright_and_named_where_it_cannot_be() -> 
     episode = Episode(repeats=0)
     episode.until_transfer()
     episode.ended(1, STEP)
-    lying = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     name = GOAL.objects[-1].name
 
     def lain(item: SceneObject) -> SceneObject:
-        return msgspec.structs.replace(item, T_base_object=pose(lying, item.T_base_object[:3, 3]))
+        return msgspec.structs.replace(item, T_base_object=pose(LYING, item.T_base_object[:3, 3]))
 
     objects = tuple(lain(item) if item.name == name else item for item in GOAL.objects)
     (task,) = episode.seen(msgspec.structs.replace(GOAL, objects=objects))
     assert isinstance(task, Task)
     verdict = the_verdict(episode.planned(status="refused", reason="no way to lift it"))
     assert verdict.reason.endswith(f"; knocked over: {name}")
+
+
+@pytest.mark.parametrize(("R", "said"), [(LYING, "; knocked over: milk_carton"), (np.eye(3), "goal holds")])
+def test_what_lies_and_nobody_had_seen_before_is_named(R: Floats, said: str) -> None:
+    """It stood behind something, and is in no goal."""
+    episode = Episode()
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    (carton,) = CARTON.graph().objects
+    carton = msgspec.structs.replace(carton, T_base_object=pose(R, carton.T_base_object[:3, 3]))
+    verdict = the_verdict(episode.seen(msgspec.structs.replace(GOAL, objects=(*GOAL.objects, carton))))
+    assert verdict.success and verdict.reason.endswith(said)
 
 
 def test_remembers_the_goal_as_pddl_by_name() -> None:
