@@ -72,20 +72,28 @@ class Memory:
             if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
                 taken |= false
-        best = {item.name: self._best(item, known.get(item.name), scene, observation) for item in scene.objects}
+        best = {item.name: self._best(item, known.get(item.name), kept, scene, observation) for item in scene.objects}
         if not kept and all(best[item.name] is item for item in scene.objects):
             return scene
         return self.related(scene, (*(best[item.name] for item in scene.objects if item.name not in taken), *kept))
 
     def _best(
-        self, item: SceneObject, before: SceneObject | None, scene: SceneGraph, observation: Observation
+        self,
+        item: SceneObject,
+        before: SceneObject | None,
+        kept: Sequence[SceneObject],
+        scene: SceneGraph,
+        observation: Observation,
     ) -> SceneObject:
-        """What something before a mug hides is mostly its handle: who saw that before knows better how it stands."""
+        """Who surely saw something before knows better how it stands than a doubtful look at what little shows of it,
+        as of a mug's handle: near where it was, or where it would reach into something else that is ``kept``."""
         if before is None or before.probability is None or item.probability is None:
+            return item
+        if not item.probability < SURE <= before.probability:
             return item
         apart = np.linalg.norm(item.T_base_object[:3, 3] - before.T_base_object[:3, 3])
         tipped = turned(self._catalogue[item.label], item.T_base_object, before.T_base_object) > TIPPED
-        if not item.probability < SURE <= before.probability or apart > _SAME or tipped:
+        if (apart > _SAME or tipped) and not any(self._overlap(item, other, scene, _THROUGH) for other in kept):
             return item
         others = [other for other in scene.objects if other.name != item.name]
         return item if self._seen_empty(before, others, observation) else before

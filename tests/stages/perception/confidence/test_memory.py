@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, pose
 from stages.messages import Observation, SceneGraph
 from stages.messages.scene import SceneObject
 from stages.perception.confidence.memory import Memory
@@ -177,6 +177,20 @@ def test_a_doubtful_pose_gives_way_to_a_sure_one_of_before(probability: float | 
     seen = msgspec.structs.replace(graph({"mug": doubted}), objects=(doubtful,))
     (mug,) = MEMORY.complete(seen, {"mug": sure}, observation({"mug": true})).objects
     np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ (true if kept else doubted), atol=1e-9)
+
+
+def test_a_doubtful_pose_that_reaches_into_what_is_remembered_gives_way_to_a_sure_one_of_before() -> None:
+    """Two sponges on each other, taken for one on its edge."""
+    layout = Layout().put("sponge_2", 0.0, 0.0).put("sponge", 0.0, 0.0, on="sponge_2")
+    before = {name: msgspec.structs.replace(one, probability=0.99) for name, one in known(layout.poses).items()}
+    on_edge = pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([0.02, 0.03, 0.035]))
+    (edge,) = graph({"sponge": on_edge}).objects
+    edge = msgspec.structs.replace(edge, name="sponge_2", probability=0.85)
+    seen = msgspec.structs.replace(graph(layout.poses), objects=(edge,))
+    scene = MEMORY.complete(seen, before, observation(layout.poses))
+    assert {one.name: one.T_base_object.tolist() for one in scene.objects} == {
+        name: one.T_base_object.tolist() for name, one in before.items()
+    }
 
 
 @pytest.mark.parametrize(("probability", "left"), [(0.3, ["tea_box"]), (0.99, ["tea_box", "tuna_can"])])
