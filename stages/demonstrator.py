@@ -485,7 +485,7 @@ class Demonstrator(Stage):
 
     def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Task | Verdict:
         """One more look at the same scene (its noise is new), or the verdict once these are used up."""
-        if self._state.repeats == self._config.repeats:
+        if not self._may_see_more():
             why = f"{why} ({self._state.repeats + 1} looks at scene '{self._state.purpose}')"
             missing = stage == "perception" and self._state.goal is not None
             return self._do_without(why, ctx) if missing else self._fail(stage, why, ctx)

@@ -316,9 +316,8 @@ class Planner(Stage):
                 continue
             if not isinstance(poses, Blocked):
                 steps = zip(found, poses, strict=True)
-                if (
-                    attempt.problem != problem or attempt.regrasped != detours
-                ):  # What was thought to be in the way need not be.
+                if attempt.problem != problem or attempt.regrasped != detours:
+                    # What was thought to be in the way need not be.
                     steps = shortened(steps, problem, targets, current, avoided=task.avoid)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, found)

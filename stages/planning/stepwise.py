@@ -21,8 +21,8 @@ from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Moves, State, Step, leads_home
 from stages.planning.targets import Blocked, Crowded, Next, Targets, neighbours
 
-_STARTS = 3
-"""Orders that are tried in two ways each, the first as the objects are listed."""
+_WAYS = 6
+"""Tried in all: orders, the first as the objects are listed; in two ways each where some belong beside others."""
 _ASIDE = 2
 """Times that one object is put aside."""
 
@@ -36,8 +36,11 @@ def stepwise(
     things stand, what belongs beside something is put aside, and what it belongs beside goes to where it was shown.
     """
     order = list(problem.items)
-    for _ in range(_STARTS):
-        for attempt, apart in ((problem, ()), (problem.laid_out_anew(), problem.regions)):
+    starts: list[tuple[Problem, Iterable[str]]] = [(problem, ())]
+    if problem.regions:
+        starts.append((problem.laid_out_anew(), problem.regions))
+    for _ in range(_WAYS // len(starts)):
+        for attempt, apart in starts:
             way = _Way(Moves(attempt, order), attempt, targets, scene, avoided)
             if way.leads_home(apart):
                 return way.steps

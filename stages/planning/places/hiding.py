@@ -68,8 +68,12 @@ def _imagined(missing: Sequence[Stances], scene: Scene) -> Iterator[Standing]:
     where nothing stands."""
     if scene.eye is None or scene.surface is None:
         return
-    on_table = [name for name, support in scene.supports.items() if support == TABLE]
-    containers = [name for name in on_table if scene.standing[name].stance.cavity]
+    supports = scene.supports.items()
+    containers = [name for name, below in supports if below == TABLE and scene.standing[name].stance.cavity]
+    standing_on = {
+        support: [scene.standing[name] for name, below in supports if below == support]
+        for support in (TABLE, *containers)
+    }
     (x0, y0), (x1, y1) = scene.surface.min(0), scene.surface.max(0)
     for stances in missing:
         for x in np.arange(x0, x1, _GRID):
@@ -77,13 +81,7 @@ def _imagined(missing: Sequence[Stances], scene: Scene) -> Iterator[Standing]:
                 T = np.eye(4)
                 T[:2, 3] = x, y
                 item = Standing.at("", stances, T)
-                for support in (TABLE, *containers):
-                    if _has_room(item, support, scene):
+                for support, others in standing_on.items():
+                    within = support == TABLE or regions.inside(item.bottom, scene.standing[support].floor)
+                    if within and all(regions.separation(item.outline, other.outline) > 0 for other in others):
                         yield scene.rested(item, support)
-
-
-def _has_room(item: Standing, support: str, scene: Scene) -> bool:
-    """Whether a place on the table or in a container is free."""
-    others = [scene.standing[name] for name, below in scene.supports.items() if below == support]
-    within = support == TABLE or regions.inside(item.bottom, scene.standing[support].floor)
-    return within and all(regions.separation(item.outline, other.outline) > 0 for other in others)
