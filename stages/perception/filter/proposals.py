@@ -95,13 +95,7 @@ class Proposals:
 
     def directions(self, T_camera_table: Floats) -> Floats:
         """The twists (rotation about the centre, translation; camera frame) the object may make, 6 x dof."""
-        if self.dof == 6:
-            return np.eye(6)
-        basis = np.zeros((6, 3))
-        basis[:3, 0] = T_camera_table[:3, 2]
-        basis[3:, 1] = T_camera_table[:3, 0]
-        basis[3:, 2] = T_camera_table[:3, 1]
-        return basis
+        return np.eye(6) if self.dof == 6 else plane_directions(T_camera_table)
 
     def own_directions(self, pose: Floats, directions: Floats) -> Floats:
         """The twists that the object may make, along and about its own axes where it may make any."""
@@ -224,6 +218,15 @@ def _moved(poses, centre, twists):  # pyright: ignore[reportMissingParameterType
                 position += (poses[p, i, j] - rotated) * centre[j]
             moved[p, i, 3] = position
     return moved
+
+
+def plane_directions(T_camera_table: Floats) -> Floats:
+    """Twists (rotation, translation; camera frame) on the plane: a turn about its normal and two slides, 6 x 3."""
+    basis = np.zeros((6, 3))
+    basis[:3, 0] = T_camera_table[:3, 2]
+    basis[3:, 1] = T_camera_table[:3, 0]
+    basis[3:, 2] = T_camera_table[:3, 1]
+    return basis
 
 
 def box_axes(vertices: Floats) -> Floats:

@@ -19,7 +19,7 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import rotation_angle, symmetry_angle, turned_within
 from stages.perception.filter.likelihood import CostForm, ObjectLikelihood, ObservedScene, Shape, Window
 from stages.perception.filter.particle_filter import Rectangle
-from stages.perception.filter.proposals import Dof, Proposals
+from stages.perception.filter.proposals import Dof, Proposals, plane_directions
 from stages.perception.filter.settings import FilterSettings
 from stages.perception.hypotheses.composition import fit, scene_cost
 from stages.perception.refinement.colour import ColourSettings, load, log_odds
@@ -38,7 +38,9 @@ _HOPE = 6.0
 """Steps by which all flips are polished first, and how many are slid; polished in full are only those whose cost then
 exceeds the present one's by less than so many times the mean distance of the visible pixels."""
 _SLIDES = ((0.012, np.deg2rad(10.0)), (0.005, np.deg2rad(4.0)))
-"""Metres and radians by which flips are slid and turned, the greater first."""
+"""Metres and radians by which flips are slid and turned in the image, the greater first."""
+_SLIDES_ON_PLANE = ((0.02, np.deg2rad(10.0)), *_SLIDES)
+"""The same on the plane."""
 _SIDES = np.array(list(product((0.0, -1.0, 1.0), repeat=3)))
 """Every way to turn and slide, staying first, 27 x 3."""
 _TURNS = 4
@@ -306,21 +308,28 @@ class _Joint:
 
     def _flips(self, i: int, place: _Place) -> Floats:
         """Those of the object's flips that are worth a full polish, polished."""
-        settings = self._settings
-        flips = self._models[i].proposals.all_flips(self._poses[i], self._scene.T_camera_table)[1:]
+        settings, T_camera_table = self._settings, self._scene.T_camera_table
+        flips = self._models[i].proposals.all_flips(self._poses[i], T_camera_table)[1:]
         rough = _improved(place, flips, steps=_ROUGH, gate=2 * settings.gate)
-        slid = self._slid(i, place, rough[np.argsort(place.likelihood.costs(rough), kind="stable")[:_PROMISING]])
+        in_image = place.directions[:, 2:5] if settings.dof == 6 else place.directions
+        slid = np.concatenate([
+            self._slid(i, place, rough, in_image, _SLIDES),
+            self._slid(i, place, flips, plane_directions(T_camera_table), _SLIDES_ON_PLANE),
+        ])  # fmt: skip
         most = place.likelihood.costs(self._poses[i][None]) + _HOPE * place.misfit
         promising = slid[place.likelihood.costs(slid) < most]
         return _improved(place, promising, steps=settings.steps, gate=settings.gate)
 
-    def _slid(self, i: int, place: _Place, poses: Floats) -> Floats:
-        """Poses slid and turned in the image (upright objects: on the plane) where that costs less.
+    def _slid(
+        self, i: int, place: _Place, poses: Floats, ways: Floats, slides: Sequence[tuple[float, float]]
+    ) -> Floats:
+        """The best of the poses, slid and turned the given ways where that costs less.
 
-        A polish sees surfaces but no outlines: what is flat would stay beside where it lies.
+        A polish sees surfaces but no outlines: what is flat would stay beside where it lies, and of a box of which one
+        end shows, a quarter turn about its middle moves that end.
         """
-        ways = place.directions[:, 2:5] if self._settings.dof == 6 else place.directions
-        for metres, radians in _SLIDES:
+        poses = poses[np.argsort(place.likelihood.costs(poses), kind="stable")[:_PROMISING]]
+        for metres, radians in slides:
             steps = _SIDES * np.where(np.abs(ways[:3]).sum(0) > 0, radians, metres)
             twists = np.tile((ways * steps[:, None]).sum(-1), (len(poses), 1))
             around = self._models[i].proposals.moved(np.repeat(poses, len(_SIDES), 0), twists)

@@ -18,7 +18,7 @@ from stages.perception.filter.settings import FilterSettings
 from stages.perception.refinement.refinement import Placed, RefinedScene, RefinementSettings, SceneRefiner
 from stages.scene.catalogue import Catalogue
 from tests.stages.perception.painted import painted
-from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, render, upright
+from tests.stages.perception.scenes import CATALOGUE, VIEW, Rendered, camera, render, upright
 
 PLACED = {"soup_can": upright("soup_can", -0.05, -0.05, 0.4), "tea_box": upright("tea_box", 0.06, 0.06, 0.2)}
 OVER = pose(exp_so3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
@@ -138,6 +138,21 @@ def test_a_flip_is_compared_by_the_symmetric_turn_that_fits(monkeypatch: pytest.
     blank = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
     refined = SceneRefiner(bar, RefinementSettings(colour=False)).refine(seen.scene, blank, [Placed("tea_box", start)])
     assert turned(refined, seen, bar)[0] < 3
+
+
+@pytest.mark.parametrize(("yaw", "x", "y"), [(1.51, -0.023, 0.026), (1.49, -0.017, 0.019), (1.56, -0.008, 0.025)])
+def test_a_quarter_turn_about_the_end_that_shows_is_undone(
+    refiner: SceneRefiner, yaw: float, x: float, y: float
+) -> None:
+    box = upright("cereal_box", 0.0, 0.0, yaw + 2.39)
+    box[2, 3] += 0.044  # on the sponge, of which a third shows
+    seen = render({"cereal_box": box, "sponge": upright("sponge", 0.0, 0.0, yaw)}, noise=0.0005)
+    blank = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
+    false = camera() @ upright("sponge", x, y, yaw + np.pi / 2)
+    placed = [Placed("cereal_box", seen.poses["cereal_box"]), Placed("sponge", false)]
+    found = refiner.refine(seen.scene, blank, placed)
+    assert max(turned(found, seen)) < 5
+    assert offset(found.objects[1].T_camera_object, seen.poses["sponge"]) < 0.005
 
 
 def test_what_is_switched_off_in_the_filter_is_off_here(seen: Rendered) -> None:
