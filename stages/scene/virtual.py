@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -50,12 +51,13 @@ def virtual_objects(
 
 
 def _region(parent: Standing, child: Standing, radius: float) -> VirtualObject:
+    return region(parent.name, child.name, inverse(parent.T_table_object) @ child.T_table_object, radius)
+
+
+def region(parent: str, child: str, T_parent_virtual: Floats, radius: float) -> VirtualObject:
+    """The region of ``parent`` in which ``child`` belongs."""
     return VirtualObject(
-        name=f"{child.name}_near_{parent.name}",
-        parent=parent.name,
-        child=child.name,
-        T_parent_virtual=inverse(parent.T_table_object) @ child.T_table_object,
-        radius=radius,
+        name=f"{child}_near_{parent}", parent=parent, child=child, T_parent_virtual=T_parent_virtual, radius=radius
     )
 
 
@@ -100,6 +102,37 @@ def _spanning(siblings: Sequence[Standing], gap: float, doubtful: Collection[str
     return chosen
 
 
+def among_neighbours(
+    virtual: Sequence[VirtualObject], found: Mapping[str, Support], poses: Mapping[str, Floats]
+) -> tuple[VirtualObject, ...]:
+    """The regions of those objects that are there, told of what one supporter carries.
+
+    ``poses`` are T_base_object by name. What stood beside another object may turn out to stand on a third one, which
+    was not seen: then that is beside it, unless it has its place among the others already.
+    """
+    placed = {name for item in virtual for name in (item.parent, item.child)}
+    told: list[VirtualObject] = []
+    for item in virtual:
+        stacks = [_downwards(name, found) for name in (item.parent, item.child)]
+        for parent, child in product(*stacks):
+            if parent == child or found[parent].parent != found[child].parent:
+                continue
+            if (parent, child) == (item.parent, item.child):
+                told.append(item)
+            elif placed.isdisjoint({parent, child} - {item.parent, item.child}):
+                told.append(region(parent, child, inverse(poses[parent]) @ poses[child], item.radius))
+    return tuple(told)
+
+
+def _downwards(name: str, found: Mapping[str, Support]) -> list[str]:
+    """An object, what carries it, what carries that, down to the table; nothing where it is not there."""
+    stack: list[str] = []
+    while name in found:
+        stack.append(name)
+        name = found[name].parent
+    return stack
+
+
 def assertions(virtual: Sequence[VirtualObject]) -> tuple[Assertion, ...]:
     """{has(parent, region), in(region, child)} for each virtual object, as in the paper."""
     has = (Assertion(predicate="has", arguments=(item.parent, item.name)) for item in virtual)
@@ -134,13 +167,7 @@ def rerooted(goal: SceneGraph, root: str) -> SceneGraph:
     turned: dict[str, VirtualObject] = {}
     while root in regions:
         old = regions[root]
-        turned[old.name] = VirtualObject(
-            name=f"{old.parent}_near_{root}",
-            parent=root,
-            child=old.parent,
-            T_parent_virtual=inverse(old.T_parent_virtual),
-            radius=old.radius,
-        )
+        turned[old.name] = region(root, old.parent, inverse(old.T_parent_virtual), old.radius)
         root = old.parent
     kept = tuple(item for item in goal.assertions if turned.keys().isdisjoint(item.arguments))
     return msgspec.structs.replace(

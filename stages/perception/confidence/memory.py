@@ -14,7 +14,7 @@ from stages.messages.scene import SceneObject
 from stages.perception.filter.likelihood import ObservedScene, Shape
 from stages.perception.hypotheses.unexplained import is_contradicted, looked_through
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
-from stages.scene import relations
+from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
 from stages.scene.doubts import SURE, is_below
 from stages.scene.naming import Named, names_kept, unique_names
@@ -118,8 +118,13 @@ class Memory:
         """The same scene, its objects with these names."""
         if all(item.name == name for item, name in zip(scene.objects, names, strict=True)):
             return scene
-        pairs = zip(scene.objects, names, strict=True)
-        return self.related(scene, [msgspec.structs.replace(item, name=name) for item, name in pairs])
+        now = {item.name: name for item, name in zip(scene.objects, names, strict=True)}
+        beside = tuple(
+            virtual.region(now[item.parent], now[item.child], item.T_parent_virtual, item.radius)
+            for item in scene.virtual_objects
+        )
+        objects = [msgspec.structs.replace(item, name=now[item.name]) for item in scene.objects]
+        return self.related(msgspec.structs.replace(scene, virtual_objects=beside), objects)
 
     def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
         view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
@@ -147,20 +152,16 @@ class Memory:
         return upwards > _THROUGH and regions.separation(a.outline, b.outline) < -depth
 
     def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
-        """The same scene with other objects: what carries what is found anew, regions stay where both objects do."""
-        names = {item.name for item in objects}
-        near = tuple(item for item in scene.virtual_objects if {item.parent, item.child} <= names)
-        beside = {item.name for item in near}
+        """The same scene with other objects: what carries what is found anew, regions stay among neighbours."""
         standing = standing_of(objects, self._stances, scene.T_base_table)
         carried = relations.supports(standing, relations.Tolerances())
+        poses = {item.name: item.T_base_object for item in objects}
+        near = virtual.among_neighbours(scene.virtual_objects, carried, poses)
         return msgspec.structs.replace(
             scene,
             objects=tuple(objects),
             virtual_objects=near,
-            assertions=(
-                *relations.assertions(carried),
-                *(item for item in scene.assertions if not beside.isdisjoint(item.arguments)),
-            ),
+            assertions=(*relations.assertions(carried), *virtual.assertions(near)),
         )
 
 

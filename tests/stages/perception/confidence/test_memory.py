@@ -155,6 +155,28 @@ def test_regions_of_what_is_seen_stay() -> None:
     assert {text for text in asserted(graph(seen)) if "_near_" in text} <= asserted(scene)
 
 
+def test_what_stands_on_something_that_is_remembered_leaves_its_place_to_that() -> None:
+    layout = Layout().put("sponge", -0.05, 0.0).put("tuna_can", 0.05, 0.0).put("tea_box", 0.0, 0.0, on="tuna_can")
+    seen = {name: layout.poses[name] for name in ("sponge", "tea_box")}
+    seen["tea_box"] = upright("tea_box", 0.05, 0.0, 0.0)  # perception puts on the table what it sees nothing below
+    scene = MEMORY.related(graph(seen), graph(layout.poses).objects)
+    assert "has(sponge, tuna_can_near_sponge)" in asserted(scene) == asserted(graph(layout.poses))
+    (region,), (expected,) = scene.virtual_objects, graph(layout.poses).virtual_objects
+    assert region.T_parent_virtual == pytest.approx(expected.T_parent_virtual)
+
+
+def test_what_stands_beside_an_equal_object_that_is_renamed_stays_beside_it() -> None:
+    here, there, box = (
+        upright("sponge", 0.2, 0.0, 0.0),
+        upright("sponge", -0.2, 0.0, 0.0),
+        upright("tea_box", 0.29, 0.0, 0.0),
+    )
+    seen = graph({"sponge": here, "sponge_2": there, "tea_box": box})
+    scene = MEMORY.named(seen, known({"sponge_2": here, "sponge": there}))
+    (region,) = scene.virtual_objects
+    assert {region.parent, region.child} == {"sponge_2", "tea_box"}
+
+
 def test_the_only_one_of_its_kind_keeps_the_name_that_is_known_where_it_stands() -> None:
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
     for seen, expected in ((here, "sponge"), (there, "sponge_2")):
