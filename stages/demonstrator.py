@@ -625,11 +625,21 @@ class Demonstrator(Stage):
         if not complaint:
             done = "done" if seen else "unknown: felt to stand, hidden from here"
             ctx.log(f"transfer {state.transfers}, {transfer.object} to {transfer.destination}: {done}")
+            state = replace(state, failures=self._forgiven(transfer.object))
         if complaint:
             # What slips from the hand is tried again: nothing is wrong with where it was to go.
             failures = state.failures if complaint.startswith("slip") else (*state.failures, transfer.key)
             state = replace(state, remainder=(transfer, *state.remainder), failures=failures)
         self._state = replace(state, transfer=None, complaint=complaint)
+
+    def _forgiven(self, moved: str) -> tuple[str, ...]:
+        """The failures once an object stands elsewhere: from there it goes to other places, and is not put aside."""
+        before = self._state.failures
+        return tuple(
+            key
+            for k, key in enumerate(before)
+            if key.partition(":")[0] != moved or before[:k].count(key) < self._config.tries
+        )
 
     def _avoided(self) -> tuple[str, ...]:
         counts = Counter(self._state.failures)

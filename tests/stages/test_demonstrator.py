@@ -278,6 +278,22 @@ def test_a_failed_transfer_is_tried_again_then_avoided() -> None:
         assert isinstance(task, Task) and task.avoid == avoided
 
 
+def test_what_was_put_aside_after_failures_is_not_put_aside_again() -> None:
+    """Its transfers go to other places, from where it stands now."""
+    episode = Episode(tries=2)
+    episode.until_task()
+    for number in (1, 2, 3, 4):
+        episode.planned(STEP)
+        episode.ended(number, STEP, failed_stage="touch", reason="8 N at the hand")
+        (task,) = episode.seen(START)
+    assert isinstance(task, Task) and task.avoid == (STEP.key, STEP.key)
+    aside = transfer("cup", "soup_can", "table")
+    episode.planned(aside, STEP)
+    episode.ended(5, aside)
+    (task,) = episode.seen(scene({"tray": "table", "soup_can": "table", "cup": "table"}, beside={}))
+    assert isinstance(task, Task) and task.avoid == (STEP.key,)
+
+
 def test_a_transfer_that_misses_its_relation_counts_as_failed() -> None:
     episode = Episode(tries=1)
     episode.until_transfer()
