@@ -121,6 +121,7 @@ def among_neighbours(
                 told.append(item)
             elif placed.isdisjoint({parent, child} - {item.parent, item.child}):
                 told.append(region(parent, child, inverse(poses[parent]) @ poses[child], item.radius))
+                placed |= {parent, child}
     return tuple(told)
 
 

@@ -9,6 +9,7 @@ from stages.geometry.poses import inverse, pose
 from stages.messages import Observation, SceneGraph
 from stages.messages.scene import SceneObject
 from stages.perception.confidence.memory import Memory
+from stages.scene import virtual
 from tests.stages.layouts import T_BASE_TABLE, Layout, asserted
 from tests.stages.perception.scenes import CATALOGUE, K, camera, render, upright
 
@@ -163,6 +164,15 @@ def test_what_stands_on_something_that_is_remembered_leaves_its_place_to_that() 
     assert "has(sponge, tuna_can_near_sponge)" in asserted(scene) == asserted(graph(layout.poses))
     (region,), (expected,) = scene.virtual_objects, graph(layout.poses).virtual_objects
     assert region.T_parent_virtual == pytest.approx(expected.T_parent_virtual)
+
+
+def test_two_on_one_that_is_remembered_leave_it_one_place() -> None:
+    layout = Layout().put("tray", 0.0, 0.0).put("cup", 0.0, -0.06, on="tray").put("soup_can", 0.0, 0.06, on="tray")
+    layout.put("milk_carton", 0.3, 0.0)
+    beside = tuple(virtual.region("milk_carton", name, np.eye(4), 0.04) for name in ("cup", "soup_can"))
+    scene = msgspec.structs.replace(graph(layout.poses), virtual_objects=beside)
+    found = [item.name for item in MEMORY.related(scene, scene.objects).virtual_objects]
+    assert found == ["tray_near_milk_carton"]
 
 
 def test_what_stands_beside_an_equal_object_that_is_renamed_stays_beside_it() -> None:
