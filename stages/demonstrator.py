@@ -22,6 +22,7 @@ from stages.messages import (
     Arrived,
     Asked,
     Assertion,
+    Brake,
     Go,
     Goal,
     Kept,
@@ -230,14 +231,14 @@ class Demonstrator(Stage):
         ctx.log("looks at what is there")
         return self._first_look("look")
 
-    def on_stop(self, stop: Stop, ctx: Context) -> Verdict | None:
-        """Lets what is under way come to its end, and nothing follow it."""
+    def on_stop(self, stop: Stop, ctx: Context) -> Verdict | Brake | None:
+        """Lets what is under way come to its end, at once where that is an arm that moves, and nothing follow it."""
         self._refuse_idle()
         if self._state.phase in (Phase.ASKING, Phase.READY):
             return self._stopped(ctx)
-        self._state = replace(self._state, stopping=True)
+        self._state = replace(self._state, stopping=True, halted=self._state.halted or stop.now)
         ctx.log(f"stops after {self._state.phase.value}")
-        return None
+        return Brake() if stop.now else None
 
     def on_pause(self, pause: Pause, ctx: Context) -> None:
         """Has the next plan wait."""

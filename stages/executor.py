@@ -29,6 +29,13 @@ if TYPE_CHECKING:
     from stages.planning.motion.transfer import Routine, TransferRoutine
 
 
+_HAS_NOT_MOVED = Outcome(
+    number=0, object="", destination="", success=True, failed_stage="", reason="", grasp="", attempts=0,
+    robot_seconds=0.0, planning_seconds=0.0,
+)  # fmt: skip
+"""Of an arm that was stopped before it was first asked for anything: it is at home still."""
+
+
 class Executor(Stage):
     """Drives one transfer, or one motion into a posture, at a time; every robot state answers the command before it."""
 
@@ -86,9 +93,8 @@ class Executor(Stage):
 
     def on_recover(self, recover: Recover, ctx: Context) -> RobotCommand | Outcome | Arrived:
         """Brings the arm home after a stop."""
-        self._ctx = ctx
-        assert self._routine is not None  # Only what was asked for can have been stopped.
-        return self._begin(self._routine.recover())
+        self._ctx, self._halted = ctx, False
+        return self._begin(self._routine.recover()) if self._routine else _HAS_NOT_MOVED
 
     def on_robot_state(self, robot_state: RobotState, ctx: Context) -> RobotCommand | Outcome | Arrived | None:
         """Continues the transfer; states that answer no command of this stage are ignored."""
@@ -96,14 +102,19 @@ class Executor(Stage):
             return None
         self._ctx = ctx
         # The stop may have come between two commands.
-        return self._advance(replace(robot_state, stopped="stop") if self._halted else robot_state)
+        stopped = replace(robot_state, stopped="stop", reason="as asked") if self._halted else robot_state
+        return self._advance(stopped)
 
     def on_stop(self, stop: Halt, ctx: Context) -> Brake:
         """Stops the arm, whatever it is doing."""
         if self._steps is None:
             raise Refused("the arm is not under way")
+        return self.on_brake(Brake())
+
+    def on_brake(self, brake: Brake) -> Brake:
+        """Stops the arm, which then stands until it is to recover: what was on its way here moves it no more."""
         self._halted = True
-        return Brake()
+        return brake
 
     def close(self) -> None:
         """Says what is in the hand of an arm that was under way."""
@@ -111,7 +122,7 @@ class Executor(Stage):
             self._log(f"stopped on the way; {self._routine.in_hand or 'nothing'} is in the hand")
 
     def _begin(self, steps: Routine | Motion | Homecoming) -> RobotCommand | Outcome | Arrived:
-        self._steps, self._halted = steps, False
+        self._steps = steps
         return self._advance(None)
 
     def _advance(self, state: RobotState | None) -> RobotCommand | Outcome | Arrived:

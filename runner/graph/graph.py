@@ -228,15 +228,13 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
             for name, kind in node.type.commands.items()
         }
 
-    def load(self, key: str, reference: str, *more: object) -> Any:
+    def load(self, key: str, reference: str) -> Any:
         """An instance of the class ``module:Class`` that a key names, given the settings of every stage by its name.
-
-        ``more`` is what the class takes besides.
 
         Raises Refused where there is no such class.
         """
         cls = load_class(reference, f"{key} of graph {self.name!r}")
-        return cls({name: node_entry(node)["config"] for name, node in self.nodes.items()}, *more)
+        return cls({name: node_entry(node)["config"] for name, node in self.nodes.items()})
 
     def processes(self) -> list[tuple[str, int]]:
         """(stage, replica) of every process."""

@@ -7,7 +7,7 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -282,9 +282,8 @@ class Story(Protocol):
     hears: tuple[type[Message], ...]
     """The messages that it follows; the others are not read."""
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
-        """``configs`` holds every stage's settings by stage name, as the graph runs with them, and ``commands`` the
-        names of what it can be asked."""
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """``configs`` holds every stage's settings by stage name, as the graph runs with them."""
         ...
 
     def hear(self, heard: Heard) -> None:
@@ -308,4 +307,4 @@ def load_story(graph: Graph) -> Story | None:
     """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""
     if graph.story is None:
         return None
-    return graph.load("story", graph.story, {name: tuple(node.type.commands) for name, node in graph.nodes.items()})
+    return graph.load("story", graph.story)

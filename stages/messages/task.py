@@ -193,6 +193,8 @@ class Stop(Command, frozen=True, kw_only=True):
     """Ends what is under way: the robot first puts down what it holds, and begins nothing more."""
 
     answers = (Verdict,)
+    now: bool = False
+    """The arm stands at once, where it is; what it holds it goes on holding."""
 
 
 class Halt(Command, frozen=True, kw_only=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -69,7 +69,7 @@ from stages.story.cards import GOALS, NAME, Remembered, add, card
 from stages.story.outlines import footprint, ground, how_sure, outlines, pixel, surety
 from stages.story.words import Words, words_of
 
-DEMONSTRATOR, EXECUTOR, WORLD, CORRECTOR = "demonstrator", "executor", "world", "corrector"
+DEMONSTRATOR, WORLD, CORRECTOR = "demonstrator", "world", "corrector"
 """Stages that take commands, as our graphs call them."""
 STEP_SECONDS = 20.0
 """What a transfer is expected to take, before one was seen."""
@@ -116,7 +116,7 @@ class Story:
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict, AskedQuestion, Answer, Go, Pause),
     )
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
         """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
         paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
         if not paths:
@@ -124,8 +124,6 @@ class Story:
         self._catalogue = Catalogue.load(Path(paths[0]))
         self._commanded = DEMONSTRATOR in configs and not configs[DEMONSTRATOR].get("scripted", True)
         self._simulated = WORLD in configs
-        self._brakes = "stop" in commands.get(EXECUTOR, ())
-        """Whether an arm that moves can be stopped at once."""
         self._folder = Path(configs[GOALS]["folder"]) if GOALS in configs else None
         self._asked: dict[str, Teach | Restore | Look] = {}
         """Commands by id, until the stage takes them up."""
@@ -404,12 +402,11 @@ class Story:
 
     def _actions(self, words: Words) -> Iterator[Action]:
         idle = self._job is None
-        stoppable = self._job is not None and not self._job.stopping
         ask = Ask("name", words.say("name"), words.say("name_hint"), NAME)
         if self._job is not None and self._job.waits:
             yield Action(DEMONSTRATOR, "go", words.say("do_go"), {}, kind="first")
         if self._job is not None and self._job.transfers and not (self._job.waits or self._job.pausing):
-            yield Action(DEMONSTRATOR, "pause", words.say("do_pause"), {}, now=stoppable)
+            yield Action(DEMONSTRATOR, "pause", words.say("do_pause"), {}, now=not self._job.stopping)
         if self._job is not None and self._job.pausing and not self._job.waits:
             yield Action(DEMONSTRATOR, "go", words.say("do_no_pause"), {})
         yield Action(DEMONSTRATOR, "teach", words.say("do_teach"), {"ask": "true"}, ask, kind="first", now=idle)
@@ -418,9 +415,7 @@ class Story:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        moves = self._brakes and self._job is not None and self._job.phase in ("move", "show", "turn")
-        who = EXECUTOR if moves else DEMONSTRATOR
-        yield Action(who, "stop", words.say("do_stop"), {}, kind="stop", now=stoppable)
+        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {"now": "true"}, kind="stop", now=not idle)
 
     def _map(self, words: Words) -> Map | None:
         """The scene from above, where people may move what carries nothing."""

@@ -15,6 +15,7 @@ from stages.messages import (
     Answer,
     Arrangement,
     Arrived,
+    Brake,
     Go,
     Goal,
     Kept,
@@ -573,6 +574,29 @@ def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -
         assert episode.called(Stop()) == []
         stopped(episode.planned(STEP) if until == "plan" else episode.ended(1, STEP))
         assert episode.seen(GOAL) == []
+
+
+@pytest.mark.parametrize("until", ["plan", "outcome", "scene"])
+def test_a_stop_at_once_brakes_the_arm_whatever_is_under_way_and_it_first_comes_home_after(until: str) -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    episode.called(Restore(name="tea"))
+    episode.seen(START)
+    if until != "plan":
+        episode.planned(STEP)
+    if until == "scene":
+        episode.ended(1, STEP)
+    assert episode.called(Stop(now=True)) == [Brake()]
+    match until:
+        case "plan":
+            ended = episode.planned(STEP)
+        case "outcome":
+            ended = episode.ended(1, STEP)
+        case _:
+            ended = episode.seen(START)
+    assert the_verdict(ended).failed_stage == STOPPED
+    assert episode.called(Restore(name="tea")) == [Recover()]
 
 
 def test_what_is_kept_on_disk_can_be_restored_and_what_was_deleted_cannot() -> None:

@@ -18,6 +18,7 @@ from stages.geometry.poses import exp_so3
 from stages.messages import (
     Arrangement,
     Arrived,
+    Brake,
     Halt,
     LookRequest,
     Outcome,
@@ -306,6 +307,27 @@ def test_an_arm_that_is_called_home_right_after_a_stop_gets_there(label: str, se
     assert bench.is_home()
     stands = before["cup"] if label == "lift cup" else target
     assert np.linalg.norm(bench.poses()["cup"][:3, 3] - stands[:3, 3]) < 0.02
+
+
+def test_an_arm_that_was_to_stand_between_two_motions_stands_until_it_is_to_recover() -> None:
+    bench = Bench(0, "tea")
+    assert bench.executor.on_brake(Brake()) == Brake()
+    home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
+    assert isinstance(home, Outcome) and home.success and not bench.states
+    before = bench.poses()
+    for _ in range(2):
+        bench.world.on_brake(bench.executor.on_brake(Brake()))
+        outcome = bench.transfer(before, "soup_can", "table", standing("soup_can", 0.55, 0.45))
+        assert (outcome.failed_stage, outcome.reason) == (STOPPED, "stopped, as asked; in the hand: nothing")
+        request = PostureRequest(
+            joint_names=ROBOT.joints, positions=ROBOT.home, table_height=0.7, occupied=np.zeros((0, 6)), label="go home"
+        )
+        arrived = bench.played(bench.executor.on_posture_request(request, bench.ctx))
+        assert isinstance(arrived, Arrived) and (arrived.stopped, arrived.reason) == ("stop", "as asked")
+        assert bench.is_home()
+        home = bench.played(bench.executor.on_recover(Recover(), bench.ctx))
+        assert isinstance(home, Outcome) and home.success and bench.is_home()
+    assert bench.transfer(before, "soup_can", "table", standing("soup_can", 0.55, 0.45)).success
 
 
 def test_the_arm_may_be_stopped_on_its_way_into_a_posture_and_comes_home() -> None:

@@ -99,7 +99,7 @@ class PostureRoutine:
         started = state.time
         goal = self._request.positions
         close = self._world.contacts(arm(self._robot, state)) | self._world.contacts(goal)
-        reason = f"no free motion; too close: {close or 'nothing'}"
+        reason = state.reason if state.stopped else f"no free motion; too close: {close or 'nothing'}"
         path = None if state.stopped else free_motion(self._world, arm(self._robot, state), goal, self._rng)
         if path is not None:
             label = self._request.label

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -63,8 +63,8 @@ class Lamp(Stage):
 class LampStory:
     hears: tuple[type[Message], ...] = (Blinked, Carry)
 
-    def __init__(self, configs: Mapping[str, Mapping[str, Any]], commands: Mapping[str, Collection[str]]) -> None:
-        assert list(configs) == list(commands) == ["lamp"] and "blink" in commands["lamp"]
+    def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        assert list(configs) == ["lamp"]
         self._blinked, self._place = 0, (0.5, 0.0)
         self._photo = s.Photo("lamp.picture-0", np.full((48, 64, 3), 90, np.uint8))
 

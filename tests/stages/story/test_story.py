@@ -59,8 +59,8 @@ LANGUAGES: tuple[Language, ...] = get_args(Language)
 class Listener:
     """A story that is told messages with ids of their own."""
 
-    def __init__(self, *, brakes: bool = False, **configs: dict[str, Any]) -> None:
-        self.story = Story({**CONFIGS, **configs}, {"executor": ("stop",) if brakes else ()})
+    def __init__(self, **configs: dict[str, Any]) -> None:
+        self.story = Story({**CONFIGS, **configs})
         self._heard = 0
 
     def hear(self, *messages: Message, causes: tuple[str, ...] = ()) -> str:
@@ -369,13 +369,12 @@ def test_a_command_may_be_recorded_before_or_after_what_it_causes(command_first:
         (CAMERAS_WAY, "Takes its camera elsewhere"),
     ],
 )
-def test_an_arm_that_moves_for_a_look_may_be_stopped(shown: str, doing: str) -> None:
-    listener = Listener(brakes=True)
+def test_what_the_arm_moves_for_before_a_look_is_said(shown: str, doing: str) -> None:
+    listener = Listener()
     listener.called(Look())
     look = LookRequest(purpose="look")
     listener.hear(LookRequest(purpose=shown), msgspec.structs.replace(frame(), name=shown))
     assert listener.doing == doing
-    assert ("executor", "stop") in {(action.stage, action.command) for action in listener.told().actions}
     listener.story.hear(Heard(look, "corrector.look_request#1", ("demonstrator.look_request#0",), 6))
     listener.hear(frame())
     assert listener.doing == "Recognises what is there"
@@ -415,7 +414,7 @@ def test_a_stop_is_told_until_it_has_come() -> None:
     listener.taught()
     listener.called(Restore(name="tea"))
     listener.hear(Stop())
-    assert (listener.doing, listener.offered()["stop"]) == ("Finishes this, then stops", False)
+    assert (listener.doing, listener.offered()["stop"]) == ("Finishes this, then stops", True)
     listener.hear(verdict(STOPPED, "stopped, as asked"))
     assert (listener.notice.text, listener.notice.good) == ("Stopped, as you asked.", True)
 
@@ -491,18 +490,13 @@ def test_who_is_meant_has_the_name_in_the_picture_of_the_plan() -> None:
     assert view.arrows[0].start[0] > 320
 
 
-@pytest.mark.parametrize("brakes", [True, False])
-def test_an_arm_that_moves_is_stopped_at_once_where_it_can_be(brakes: bool) -> None:
-    listener = Listener(brakes=brakes)
+def test_a_stop_is_at_once_and_what_is_in_the_hand_is_told() -> None:
+    listener = Listener()
     listener.taught()
     listener.called(Restore(name="tea"))
-
-    def who() -> str:
-        return next(one.stage for one in listener.told().actions if one.kind == "stop")
-
-    assert who() == "demonstrator"
     listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1))
-    assert who() == ("executor" if brakes else "demonstrator")
+    (stop,) = (action for action in listener.told().actions if action.kind == "stop")
+    assert (stop.stage, stop.command, stop.arguments) == ("demonstrator", "stop", {"now": "true"})
     listener.hear(verdict(STOPPED, "stopped, as asked; in the hand: cup"))
     assert listener.notice.text == "Stopped, as you asked; in the hand is still the cup."
 
@@ -560,7 +554,7 @@ def test_a_scripted_robot_takes_no_commands() -> None:
 
 def test_a_graph_without_objects_has_no_story() -> None:
     with pytest.raises(Refused, match="story: none of the stages camera has a setting `catalogue`; objects need one"):
-        Story({"camera": {}}, {})
+        Story({"camera": {}})
 
 
 # ------------------------------------------------------------------------------------------ languages
