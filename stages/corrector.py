@@ -15,7 +15,7 @@ from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
 from stages.messages import Arrived, Calibrate, Correction, Frame, LookRequest, PostureRequest
 from stages.messages.correction import CAMERAS_WAY, OWN_ARM
-from stages.messages.task import STOPPED
+from stages.messages.task import STANDS
 from stages.perception.correction.body import RobotSurface
 from stages.perception.correction.occupied import occupied
 from stages.perception.correction.registration import Posture, Registration, Sight
@@ -175,7 +175,7 @@ class Corrector(Stage):
     def on_arrived(self, arrived: Arrived, ctx: Context) -> Iterator[PostureRequest | LookRequest | Correction]:
         """Looks at the arm, or goes on where it did not get there; after a touch it goes home."""
         state = self._state = replace(self._state, robot_seconds=self._state.robot_seconds + arrived.robot_seconds)
-        if arrived.stopped == STOPPED:
+        if arrived.stopped in STANDS:
             # What was asked for falls away; an arm that was showing itself does so again before the next look.
             turning = state.phase is Phase.TURNING
             self._state = replace(state, phase=Phase.IDLE, asked=None, view=None) if turning else State()

@@ -45,7 +45,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.messages.scene import SceneObject
-from stages.messages.task import STOPPED
+from stages.messages.task import STANDS, STOPPED
 from stages.perception.confidence.memory import Memory
 from stages.planning.places.hiding import hiders
 from stages.planning.places.placements import Scene
@@ -117,6 +117,8 @@ class State:
     """Where each object was last seen or placed since the scene was arranged, by name. Never changed, only replaced."""
     remembered: tuple[str, ...] = ()
     """Objects of that scene that the look did not show."""
+    unproved: frozenset[str] = frozenset()
+    """Objects that were let go of, not felt to stand, and not seen since."""
     transfer: Transfer | None = None
     """Requested, and its effect not seen yet."""
     remainder: tuple[Transfer, ...] = ()
@@ -270,9 +272,11 @@ class Demonstrator(Stage):
         ctx.log(f"{doubt.key}: {answer.choice}")
         return self._answered(doubt.key, answer.choice, ctx)
 
-    def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | None:
+    def on_robot_state(self, robot_state: RobotState, ctx: Context) -> LookRequest | Verdict | None:
         """Looks once a scene is arranged. Robot states that end the executor's motions are not for this stage."""
-        return self._look(self._state.purpose) if self._state.phase is Phase.ARRANGING else None
+        if self._state.phase is not Phase.ARRANGING:
+            return None
+        return self._stopped(ctx) if self._state.stopping else self._look(self._state.purpose)
 
     def on_scene_graph(
         self, scene_graph: SceneGraph, observation: Observation, ctx: Context
@@ -281,6 +285,7 @@ class Demonstrator(Stage):
         if self._state.phase is not Phase.LOOKING:
             return
         if self._state.stopping:
+            self._state = replace(self._state, looks=self._state.looks + 1)
             yield self._stopped(ctx)
             return
         if not self._state.goal_name:
@@ -316,16 +321,17 @@ class Demonstrator(Stage):
             return
         scene_graph = self._memory.named(scene_graph, state.known)
         scene = self._memory.complete(scene_graph, state.known, observation)
-        seen, ahead = state.seen | _names(scene_graph), state.views[1:]
+        seen, ahead, unproved = state.seen | _names(scene_graph), state.views[1:], state.unproved
         if state.goal is not None and (not state.known or _spares(scene, state.goal)):
             names = self._exchanged(scene, state.goal)
-            seen = frozenset(names.get(name, name) for name in seen)
+            seen, unproved = (frozenset(names.get(name, name) for name in some) for some in (seen, unproved))
             scene = self._memory.renamed(scene, [names[item.name] for item in scene.objects])
         self._state = replace(
             self._state,
             known={item.name: item for item in scene.objects if not self._is_unlikely(item)},
             looks=self._state.looks + 1,
             seen=seen,
+            unproved=unproved - seen,
         )
         if ahead:
             self._state = replace(self._state, views=ahead)
@@ -356,9 +362,9 @@ class Demonstrator(Stage):
         """Starts the plan's first transfer, or gives up where there is none."""
         if self._state.phase is not Phase.PLANNING:
             return None
+        self._state = replace(self._state, plans=self._state.plans + 1)
         if self._state.stopping:
             return self._stopped(ctx)
-        self._state = replace(self._state, plans=self._state.plans + 1)
         if plan.status != "solved":
             return self._without_plan(plan, ctx)
         if self._state.missing:
@@ -384,7 +390,7 @@ class Demonstrator(Stage):
 
     def on_outcome(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict | None:
         """Looks at what the transfer did, whatever the hand has felt."""
-        stands = outcome.failed_stage in (STOPPED, "fault") or outcome.held
+        stands = outcome.failed_stage in STANDS or outcome.held
         if stands and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
             self._state = replace(self._state, halted=True)
             stage = STOPPED if outcome.failed_stage == STOPPED else "executor"
@@ -401,28 +407,36 @@ class Demonstrator(Stage):
         )
         if self._state.stopping:
             return self._stopped(ctx)
-        self._state = replace(self._state, complaint=complaint, repeats=0, known=self._known_after(outcome))
+        unfelt = {outcome.object} if outcome.T_base_object is not None and not outcome.success else set[str]()
+        unproved = self._state.unproved - {outcome.object} | unfelt
+        known = self._known_after(outcome)
+        self._state = replace(self._state, complaint=complaint, repeats=0, known=known, unproved=unproved)
         return self._look(f"after transfer {outcome.number}")
 
     def on_arrived(self, arrived: Arrived, ctx: Context) -> Verdict | None:
-        """The arm shows itself and brings the camera to where it looks from; who stops it then wants no look."""
+        """The arm shows itself and brings the camera to where it looks from; where it is stopped or fails itself, there
+        is no look."""
         self._state = replace(self._state, astray="" if arrived.success else arrived.reason)
-        if arrived.stopped != STOPPED or self._state.phase is not Phase.LOOKING:
+        if arrived.stopped not in STANDS or self._state.phase is not Phase.LOOKING:
             return None
         self._state = replace(self._state, halted=True)
-        return self._conclude(STOPPED, arrived.reason, ctx)
+        return self._conclude(STOPPED if arrived.stopped == STOPPED else "executor", arrived.reason, ctx)
 
     def _recovered(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict:
         """The arm is at home again, or not."""
-        if outcome.success:
-            self._state = replace(self._state, halted=False)
-            return self._look(self._state.purpose)
-        return self._fail("executor", outcome.reason, ctx)
+        if not outcome.success:
+            return self._fail("executor", outcome.reason, ctx)
+        if self._state.stopping:
+            return self._stopped(ctx)
+        self._state = replace(self._state, halted=False)
+        return self._look(self._state.purpose)
 
     def _goal(self, name: str) -> SceneGraph:
         goals = self._state.goals
         if name not in goals:
             raise Refused(f"name={name!r}: no such goal; valid: {', '.join(goals) or 'none, teach one first'}")
+        if not goals[name].objects:
+            raise Refused(f"name={name!r}: names no object; teach it again, or restore another one")
         return goals[name]
 
     def _refuse_idle(self) -> None:
@@ -494,7 +508,7 @@ class Demonstrator(Stage):
         ctx.log(f"{why}; looking again", level="warning")
         return self._look(self._state.purpose)
 
-    def _do_without(self, why: str, ctx: Context) -> Task | Verdict:
+    def _do_without(self, why: str, ctx: Context) -> LookRequest | Task | Verdict:
         """Restores what the goal says of everything else; what is missing is named in the end."""
         goal, scene = self._state.goal, self._state.scene
         assert goal is not None and scene is not None
@@ -529,7 +543,7 @@ class Demonstrator(Stage):
         if self._state.goal is None:
             if self._state.astray:
                 return f"the camera is not where it looks from: {self._state.astray}"
-            wanted = 0 if self._config.n_objects == "auto" else self._config.n_objects
+            wanted = 1 if self._config.n_objects == "auto" else max(1, self._config.n_objects)
             if len(scene.objects) < wanted:
                 return f"{len(scene.objects)} of {wanted} objects seen"
             standing = standing_of(scene.objects, self._stances, scene.T_base_table)
@@ -567,10 +581,10 @@ class Demonstrator(Stage):
         yield Goal(name=name, scene=scene, pddl=goal_pddl(name, scene))
         self._state = replace(self._state, goals=goals, goal=scene, phase=Phase.IDLE, repeats=0)
         if self._config.scripted:
-            self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start", known={})
+            self._state = replace(self._state, phase=Phase.ARRANGING, purpose="start", known={}, scene=None)
             yield Arrangement(kind="start")
 
-    def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> Task | Verdict:
+    def _compare(self, goal: SceneGraph, scene: SceneGraph, ctx: Context) -> LookRequest | Task | Verdict:
         """Checks the transfer that led here, then the goal; asks for a plan where relations are violated.
 
         What was turned in vain as often as is tried need not show a side any more, until the verdict.
@@ -588,13 +602,8 @@ class Demonstrator(Stage):
             rest = left_out(goal, str(wrong))
             self._state = replace(self._state, whole=self._state.whole or goal, goal=rest, lacking=lacking)
             return self._compare(rest, scene, ctx)
-        if not violated and self._state.lacking:
-            return self._fail("perception", f"{self._state.lacking}; every other relation of the goal holds", ctx)
-        if not violated and (unsure := _doubtful_parents(goal)):
-            why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
-            return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
         if not violated:
-            return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
+            return self._claim(goal, from_memory, ctx)
         if self._state.transfers == self._config.max_transfers:
             why = self._state.complaint or f"{violated[0]} does not hold"
             return self._fail("executor", f"{self._state.transfers} transfers were not enough; {why}", ctx)
@@ -602,6 +611,19 @@ class Demonstrator(Stage):
         ahead = () if self._state.complaint else self._state.remainder
         then = tuple(action for transfer in ahead for action in (transfer.pick, transfer.place))
         return Task(goal_name=self._state.goal_name, goal=goal, current=scene, avoid=self._avoided(), then=then)
+
+    def _claim(self, goal: SceneGraph, from_memory: str, ctx: Context) -> LookRequest | Task | Verdict:
+        """The verdict where every relation of the goal holds, unless that is yet to be proved."""
+        state = self._state
+        if state.lacking:
+            return self._fail("perception", f"{state.lacking}; every other relation of the goal holds", ctx)
+        if hidden := state.unproved.intersection(state.remembered):
+            why = f"let go of, neither felt to stand nor seen since: {', '.join(sorted(hidden))}"
+            return self._look_again("perception", why, ctx)
+        if unsure := _doubtful_parents(goal):
+            why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
+            return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
+        return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
 
     def _check_transfer(self, scene: SceneGraph, ctx: Context) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan.
@@ -690,6 +712,8 @@ class Demonstrator(Stage):
             reason = f"{reason}; {state.lacking}"
         if fallen := self._fallen():
             reason = f"{reason}; knocked over: {', '.join(fallen)}"
+        if gone := self._gone():
+            reason = f"{reason}; not seen any more: {', '.join(gone)}"
         phase = Phase.DONE if self._config.scripted else Phase.IDLE
         self._state = replace(state, phase=phase, question=None, shown=None, waits="", plan=None)
         return Verdict(
@@ -709,6 +733,15 @@ class Demonstrator(Stage):
         state = self._state
         assert state.goal is not None and state.scene is not None  # A plan answers a task, and a task holds both.
         return f"{satisfied(state.goal, state.scene, self._catalogue)[1][0]} does not hold"
+
+    def _gone(self) -> list[str]:
+        """What was there at the start, is in no goal, and is seen nowhere now."""
+        state = self._state
+        goal = state.whole or state.goal
+        if state.scene is None or state.first is None or goal is None:
+            return []
+        known = _names(state.scene) | _names(goal)
+        return [item.name for item in state.first.objects if item.name not in known and not is_below(item, UNSURE)]
 
     def _fallen(self) -> list[str]:
         """What lies and stands neither as at the start nor as in the goal, or of what was not seen then, as such things

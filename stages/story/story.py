@@ -448,7 +448,9 @@ class Story:
             names = [item.name for item in end.scene.objects]
             return Notice(True, words.say("remembered", name=end.name, objects=words.nouns(names)), message=id)
         if end.success:
-            return Notice(True, words.say("restored", name=end.goal_name), message=id)
+            _, _, besides = reasons.told(end.reason, words).partition("; ")
+            notes = (f"{words.capital(besides)}.",) if besides else ()
+            return Notice(True, words.say("restored", name=end.goal_name), notes, message=id)
         if end.failed_stage == STOPPED:
             return Notice(True, f"{words.capital(reasons.told(end.reason, words))}.", message=id)
         key = "failed" if end.goal_name in self._goals else "not_remembered"

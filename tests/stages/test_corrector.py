@@ -176,8 +176,9 @@ def test_after_a_touch_the_arm_goes_home_and_what_is_in_the_way_is_looked_at_aga
     assert passed == [LOOK]
 
 
-def test_whoever_stops_the_arm_gets_no_look_and_the_next_one_begins_again() -> None:
+@pytest.mark.parametrize("stopped", ["stop", "fault"])
+def test_an_arm_that_is_stopped_or_fails_takes_no_look_and_the_next_one_begins_again(stopped: Stopped) -> None:
     corrector = under_way()
-    assert not list(corrector.on_arrived(arrived(success=False, stopped="stop"), CTX))
+    assert not list(corrector.on_arrived(arrived(success=False, stopped=stopped), CTX))
     (survey,) = corrector.on_look_request(LOOK, CTX)
     assert survey == SURVEY

@@ -205,6 +205,17 @@ def test_what_lies_and_nobody_had_seen_before_is_named(R: Floats, said: str) -> 
     assert verdict.success and verdict.reason.endswith(said)
 
 
+def test_what_is_in_no_goal_and_not_seen_any_more_is_named() -> None:
+    episode = Episode()
+    carton, shaker = (Layout({name: upright(name, 0.0, 0.3, 0.0)}).graph() for name in ("milk_carton", "salt_shaker"))
+    doubtful = msgspec.structs.replace(shaker.objects[0], probability=0.2)
+    episode.until_task(start=msgspec.structs.replace(START, objects=(*START.objects, *carton.objects, doubtful)))
+    episode.planned(STEP)
+    episode.ended(1, STEP)
+    verdict = the_verdict(episode.seen(GOAL, view(Layout({}))))
+    assert verdict.success and verdict.reason.endswith("goal holds; not seen any more: milk_carton")
+
+
 def test_remembers_the_goal_as_pddl_by_name() -> None:
     episode = Episode(goal_name="tea-time")
     episode.until_task()
@@ -412,6 +423,38 @@ def test_an_object_that_is_hidden_counts_as_being_where_it_was_placed() -> None:
     assert verdict.success and "remembered, not seen: salt_shaker" in verdict.reason
 
 
+def test_an_object_that_was_neither_felt_to_stand_nor_seen_does_not_count_as_being_there() -> None:
+    """Nor does it after another transfer, which went well."""
+    episode = Episode(repeats=1)
+    episode.until_task(with_shaker(HIDDEN).graph(), with_shaker(OPEN).graph())
+    step, look = transfer("salt_shaker", "table", "table"), view(with_shaker(HIDDEN))
+    episode.planned(step)
+    episode.ended(1, step, at=T_BASE_TABLE @ HIDDEN, failed_stage="unknown", reason="nothing was felt")
+    assert episode.seen(CARTON.graph(), look) == [LookRequest(purpose="after transfer 1, look 2")]
+    verdict = the_verdict(episode.seen(CARTON.graph(), look))
+    said = "let go of, neither felt to stand nor seen since: salt_shaker"
+    assert (verdict.success, verdict.failed_stage) == (False, "perception") and said in verdict.reason
+
+    episode, away, home = Episode(repeats=1), with_shaker(OPEN), with_shaker(HIDDEN)
+    away.put("cup", -0.15, -0.1)
+    home.put("cup", 0.0, 0.0, on="milk_carton")
+    onto = transfer("cup", "table", "milk_carton")
+    episode.until_task(home.graph(), away.graph())
+    episode.planned(step, onto)
+    episode.ended(1, step, at=T_BASE_TABLE @ HIDDEN, failed_stage="unknown", reason="nothing was felt")
+    (task,) = episode.seen(less(away), look)
+    assert isinstance(task, Task)
+    episode.planned(onto)
+    episode.ended(2, onto)
+    assert episode.seen(less(home), look) == [LookRequest(purpose="after transfer 2, look 2")]
+    assert the_verdict(episode.seen(home.graph(), look)).success
+
+
+def less(layout: Layout) -> SceneGraph:
+    """A look that does not show the shaker."""
+    return Layout({name: T for name, T in layout.poses.items() if name != "salt_shaker"}).graph()
+
+
 def test_an_object_that_something_was_placed_in_front_of_counts_as_being_where_it_was_seen() -> None:
     aside = Layout({"milk_carton": upright("milk_carton", -0.15, -0.1, 0.0), "salt_shaker": HIDDEN})
     episode = Episode()
@@ -576,6 +619,39 @@ def test_a_stop_ends_a_job_with_what_is_under_way_and_the_next_command_works() -
         assert episode.seen(GOAL) == []
 
 
+def test_a_stop_while_the_arm_comes_home_ends_the_task_there() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    episode.seen(GOAL)
+    episode.called(Restore(name="tea"))
+    episode.called(Stop(now=True))
+    episode.seen(START)
+    for _ in range(2):
+        assert episode.called(Restore(name="tea")) == [Recover()]
+        assert episode.called(Stop()) == []
+        assert the_verdict(episode.ended(0, STEP)).failed_stage == STOPPED
+
+
+@pytest.mark.parametrize("until", ["the scene is arranged", "scene", "plan"])
+def test_the_verdict_of_a_stop_counts_what_ended_with_it(until: str) -> None:
+    """The report waits for as many looks and plans; of a scene that was not looked at it says nothing."""
+    episode = Episode()
+    if until == "plan":
+        episode.until_task()
+        episode.called(Stop())
+        verdict = the_verdict(episode.planned(STEP))
+        assert (verdict.looks, verdict.plans) == (2, 1)
+        return
+    episode.take(episode.stage.on_start(episode.ctx))
+    episode.arranged()
+    episode.seen(GOAL)
+    if until == "scene":
+        episode.arranged()
+    episode.called(Stop())
+    verdict = the_verdict(episode.seen(START) if until == "scene" else episode.arranged())
+    assert (verdict.looks, verdict.satisfied, verdict.violated) == (1 + (until == "scene"), (), ())
+
+
 @pytest.mark.parametrize("until", ["plan", "outcome", "scene"])
 def test_a_stop_at_once_brakes_the_arm_whatever_is_under_way_and_it_first_comes_home_after(until: str) -> None:
     episode = Episode(scripted=False)
@@ -597,6 +673,30 @@ def test_a_stop_at_once_brakes_the_arm_whatever_is_under_way_and_it_first_comes_
             ended = episode.seen(START)
     assert the_verdict(ended).failed_stage == STOPPED
     assert episode.called(Restore(name="tea")) == [Recover()]
+
+
+def test_an_arm_that_fails_on_its_way_to_a_look_ends_the_task_and_first_comes_home_after() -> None:
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    arrived = Arrived(
+        success=False, reason="protective stop on the way to show 1", stopped="fault", joint_names=(),
+        positions=np.zeros(0), robot_seconds=1.0,
+    )  # fmt: skip
+    verdict = the_verdict(episode.take(episode.stage.on_arrived(arrived, episode.ctx)))
+    assert (verdict.failed_stage, verdict.reason) == ("executor", "protective stop on the way to show 1")
+    assert episode.called(Teach(name="tea")) == [Recover()]
+
+
+def test_nothing_is_no_goal() -> None:
+    episode = Episode(scripted=False, repeats=0)
+    episode.called(Teach(name="tea"))
+    empty = msgspec.structs.replace(GOAL, objects=(), assertions=(), virtual_objects=())
+    verdict = the_verdict(episode.seen(empty))
+    assert (verdict.success, verdict.reason) == (False, "0 of 1 objects seen (1 looks at scene 'goal tea')")
+    keeping = KeepingDemonstrator(Demonstrator.Config(catalogue=CATALOGUE, scripted=False))
+    keeping.on_kept(Kept(goals=(Goal(name="void", scene=empty, pddl=""),)))
+    with pytest.raises(Refused, match="name='void': names no object"):
+        keeping.on_restore(Restore(name="void"), episode.ctx)
 
 
 def test_what_is_kept_on_disk_can_be_restored_and_what_was_deleted_cannot() -> None:

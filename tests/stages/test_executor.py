@@ -344,6 +344,11 @@ def test_the_arm_may_be_stopped_on_its_way_into_a_posture_and_comes_home() -> No
 
     bench.meddle = stop
     stopped = bench.played(bench.executor.on_posture_request(request, bench.ctx))
+    read = bench.executor.on_recover(Recover(), bench.ctx)
+    bench.executor.on_brake(Brake())
+    stays = bench.played(read)
+    assert isinstance(stays, Outcome) and (stays.failed_stage, stays.reason) == (STOPPED, "as asked")
+    assert not bench.is_home()
     assert isinstance(stopped, Arrived) and (stopped.success, stopped.stopped) == (False, "stop")
     assert stopped.reason == "as asked on the way to show" and 0.5 < stopped.robot_seconds < 1.0
     bench.simulation.run(1.0)
@@ -490,6 +495,42 @@ def test_what_stands_in_the_way_unseen_is_felt_and_what_is_held_goes_back() -> N
     after = bench.poses()
     assert np.linalg.norm(after["cup"][:3, 3] - before["cup"][:3, 3]) < 0.02
     assert after["tea_box"][2, 2] > 0.99
+
+
+def test_what_goes_back_to_where_nothing_bears_it_any_more_has_failed_for_the_reason_that_it_went_back() -> None:
+    bench, gone = Bench(0, "breakfast"), list[str]()
+    x, y = bench.poses()["tea_box"][:2, 3]
+    height = bench.poses()["milk_carton"][2, 3] + catalogue()["milk_carton"].dimensions[2]
+    on_top = standing("cup", *bench.poses()["milk_carton"][:2, 3])
+    on_top[2, 3] = height
+    bench.simulation.place("cup", on_top)
+    seen = {name: T for name, T in bench.poses().items() if name != "tea_box"}
+
+    def take_away(label: str) -> None:
+        if label == "carry cup back" and not gone:
+            gone.append("milk_carton")
+            bench.simulation.place("milk_carton", standing("milk_carton", 0.5, 0.6), settle=0.0)
+
+    bench.meddle = take_away
+    outcome = bench.transfer(seen, "cup", "table", standing("cup", x, y))
+    assert gone and (outcome.failed_stage, outcome.held) == ("touch", "") and outcome.T_base_object is not None
+    assert "N at the hand" in outcome.reason
+
+
+def test_an_arm_of_which_nobody_knows_where_it_is_stands_and_says_why() -> None:
+    bench = Bench(0, "tea")
+    request = PostureRequest(
+        joint_names=ROBOT.joints, positions=ROBOT.home, table_height=0.7, occupied=np.zeros((0, 6)), label="go home"
+    )
+    lost = RobotState(
+        joint_names=(), positions=np.zeros(0), gripper_width=0.0, time=0.0, stopped="fault", reason="no joint states"
+    )
+    assert isinstance(bench.executor.on_posture_request(request, bench.ctx), RobotCommand)
+    arrived = bench.executor.on_robot_state(lost, bench.ctx)
+    assert isinstance(arrived, Arrived) and (arrived.stopped, arrived.reason) == ("fault", "no joint states")
+    assert isinstance(bench.executor.on_recover(Recover(), bench.ctx), RobotCommand)
+    stays = bench.executor.on_robot_state(lost, bench.ctx)
+    assert isinstance(stays, Outcome) and (stays.failed_stage, stays.reason) == ("fault", "no joint states")
 
 
 def test_what_is_seen_but_not_known_is_kept_clear_of() -> None:

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -134,6 +135,14 @@ def test_waits_for_everything_behind_the_verdict(missing: int, tmp_path: Path) -
     del arrivals[missing]
     finished, _ = run(arrivals, tmp_path)
     assert finished == []
+
+
+def test_a_verdict_of_no_relations_ends_an_episode_of_which_a_goal_is_there(tmp_path: Path) -> None:
+    """Somebody stopped it before its scene was looked at."""
+    stopped = msgspec.structs.replace(verdict(success=False), satisfied=(), violated=(), looks=1, plans=0, transfers=0)
+    arrivals = [*episode()[:2], lambda report, ctx: report.on_verdict(stopped, ctx)]
+    (finished,), _ = run(arrivals, tmp_path)
+    assert finished.code == 1
 
 
 def test_shows_scenes_scores_and_restarts(tmp_path: Path) -> None:

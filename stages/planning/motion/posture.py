@@ -98,9 +98,11 @@ class PostureRoutine:
         state = yield robot_command(self._robot, "read the encoders")
         started = state.time
         goal = self._request.positions
-        close = self._world.contacts(arm(self._robot, state)) | self._world.contacts(goal)
-        reason = state.reason if state.stopped else f"no free motion; too close: {close or 'nothing'}"
-        path = None if state.stopped else free_motion(self._world, arm(self._robot, state), goal, self._rng)
+        path, reason = None, state.reason
+        if not state.stopped:
+            close = self._world.contacts(arm(self._robot, state)) | self._world.contacts(goal)
+            reason = f"no free motion; too close: {close or 'nothing'}"
+            path = free_motion(self._world, arm(self._robot, state), goal, self._rng)
         if path is not None:
             label = self._request.label
             state = yield robot_command(self._robot, label, path, guard=Guard(force=_BUMP))
@@ -123,7 +125,9 @@ class PostureRoutine:
         """Commands that bring the arm home from where it was stopped."""
         state = yield robot_command(self._robot, "read the encoders")
         started = state.time
-        path = free_motion(self._world, arm(self._robot, state), self._robot.home, self._rng)
+        path = None
+        if not state.stopped:
+            path = free_motion(self._world, arm(self._robot, state), self._robot.home, self._rng)
         if path is not None:
             state = yield robot_command(self._robot, "go home", path, guard=Guard(force=_BUMP))
         arrived = path is not None and not state.stopped and not state.shown
@@ -132,8 +136,8 @@ class PostureRoutine:
             object="",
             destination="",
             success=arrived,
-            failed_stage="" if arrived else "stop" if state.stopped == "stop" else "touch",
-            reason=state.reason if path is not None else "no free motion home",
+            failed_stage="" if arrived else state.stopped or "touch",
+            reason="no free motion home" if path is None and not state.stopped else state.reason,
             grasp="",
             attempts=0,
             robot_seconds=state.time - started,

@@ -144,7 +144,7 @@ class TransferRoutine:
         except _BrokenOff as broken:
             let_go = self._tally.T_base_object is not None
             failure = yield from self._come_back(broken)
-            if not failure[0]:
+            if not failure[0] or (failure[0] == "unknown" and not let_go):
                 # Whether what was let go of before stands where it should is for the next look to say.
                 failure = "unknown" if let_go else broken.state.stopped, str(broken)
         ending = f"{failure[0]}: {failure[1]}" if failure[0] else "let go of, and felt to stand"
@@ -159,6 +159,8 @@ class TransferRoutine:
             failure = yield from self._way_back(state)
         except _BrokenOff as broken:
             failure = yield from self._come_back(broken)
+        if failure[0] == "unknown":
+            failure = "", ""  # The arm is at home; whether what it held stands is for the next look to say.
         return replace(self._outcome(*failure), number=0)
 
     def _come_back(self, broken: _BrokenOff) -> Steps:

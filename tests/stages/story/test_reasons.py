@@ -31,6 +31,10 @@ SAID = {
     "not seen: cup; every other relation of the goal holds; knocked over: mug": (
         "nicht zu sehen: die Tasse; alles andere ist am Platz; umgefallen: der Becher"
     ),
+    "let go of, neither felt to stand nor seen since: cup (3 looks at scene 'after transfer 1')": (
+        "losgelassen, ohne den Stand zu spüren, und seitdem nicht gesehen: die Tasse, nach 3-mal Hinsehen"
+    ),
+    "name='tea': names no object; teach it again, or restore another one": "in der Szene „tea“ ist nichts",
     "unknown: nothing was felt below cup where it was let go of": (
         "unter der Tasse war beim Loslassen nichts zu spüren"
     ),

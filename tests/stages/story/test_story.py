@@ -409,6 +409,16 @@ def test_a_restore_is_told_step_by_step() -> None:
     assert (listener.notice.good, listener.notice.text) == (True, "“tea” is restored: everything is where it belongs.")
 
 
+def test_a_success_says_what_is_hidden_lies_or_is_gone_all_the_same() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    ending = "remembered, not seen: cup; knocked over: mug; not seen any more: milk_carton"
+    listener.hear(verdict(reason=f"every relation of the goal holds; {ending}"))
+    notes = ("Hidden, so not seen: the cup; fallen over: the mug; not there any more: the milk carton.",)
+    assert (listener.notice.good, listener.notice.help) == (True, notes)
+
+
 def test_a_stop_is_told_until_it_has_come() -> None:
     listener = Listener()
     listener.taught()
