@@ -415,7 +415,7 @@ def test_a_success_says_what_is_hidden_lies_or_is_gone_all_the_same() -> None:
     listener.called(Restore(name="tea"))
     ending = "remembered, not seen: cup; knocked over: mug; not seen any more: milk_carton"
     listener.hear(verdict(reason=f"every relation of the goal holds; {ending}"))
-    notes = ("Hidden, so not seen: the cup; fallen over: the mug; not there any more: the milk carton.",)
+    notes = ("Hidden from here: the cup; fallen over: the mug; not there any more: the milk carton.",)
     assert (listener.notice.good, listener.notice.help) == (True, notes)
 
 
