@@ -138,6 +138,14 @@ class Deal(msgspec.Struct, frozen=True):
     id: IdText
 
 
+class CaughtUp(msgspec.Struct, frozen=True):
+    """What the recorder says to a process that took the place of another, once it has sent all that is older."""
+
+    undone: tuple[tuple[str, str, IdText], ...] = ()
+    """(consumer, port, message id) of the parts that earlier processes of the stage have sent and nobody has done
+    with."""
+
+
 class LogLine(msgspec.Struct, frozen=True):
     """One line a stage (or the supervisor) shows to people."""
 
@@ -390,7 +398,7 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
     return array
 
 
-def pack(record: Envelope | Step | Journal | Deal | Lost | LogLine | Pulse) -> bytes:
+def pack(record: Envelope | Step | Journal | CaughtUp | Deal | Lost | LogLine | Pulse) -> bytes:
     """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many."""
     payload = _ENCODER.encode(record)
     try:

@@ -96,12 +96,8 @@ class Delivery:
         warn: Warn,
         *,
         stopping: Callable[[], bool],
-        undone: Iterable[tuple[str, str, str]] = (),
     ):
-        """``stopping`` is asked again and again while a publisher waits.
-
-        ``undone`` are parts, (consumer, port, id), that an earlier process has sent and nobody has done with.
-        """
+        """``stopping`` is asked again and again while a publisher waits."""
         self._stage = stage
         self._edges = [Outgoing(route) for route in routes]
         self._publish = publish
@@ -110,9 +106,6 @@ class Delivery:
         self._stopping = stopping
         self._newest: dict[tuple[str, int], Process] = {}
         """The newest process seen of each replica."""
-        for consumer, port, message_id in undone:
-            for edge in self._edges_to(consumer, port):
-                edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
         self._to_deal = threading.Event()
         if any(edge.route.shared for edge in self._edges):
             vital_thread("dealer", self._deal_all).start()
@@ -128,6 +121,15 @@ class Delivery:
                     self._take_room(edge, envelope)
         finally:
             self._publish(f"m/{self._stage}/{port}", payload)
+        self._to_deal.set()
+
+    def take_over(self, undone: Iterable[tuple[str, str, str]]) -> None:
+        """Deals the parts, (consumer, port, id), that earlier processes have sent and nobody has done with."""
+        with self._changed:
+            for consumer, port, message_id in undone:
+                for edge in self._edges_to(consumer, port):
+                    if message_id not in edge.unanswered:
+                        edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
         self._to_deal.set()
 
     def answered(self, consumer: str, done: Iterable[tuple[str, str]]) -> None:

@@ -19,7 +19,7 @@ import msgspec
 
 from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.graph import SUPERVISOR
-from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Step, pack
+from runner.message.codec import CaughtUp, CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, is_orphan, print_where_it_crashes
@@ -185,7 +185,7 @@ class Recorder:
         with self._changing:
             del self._lagging[process]
         self._redelivery.catch_up(process)
-        self._say(f"ready/{process.path}", b"")
+        self._say(f"ready/{process.path}", pack(CaughtUp(tuple(self._redelivery.undone(process.stage)))))
 
     def _on_message(self, envelope: Envelope, packet: Packet) -> None:
         topic = packet.key.partition("/")[2]

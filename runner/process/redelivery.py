@@ -7,9 +7,12 @@ consumed is still to be done.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import itemgetter
+from typing import NamedTuple
 
 from runner.graph.graph import Route
 from runner.message.codec import Envelope, Step, answered
@@ -23,29 +26,37 @@ Send = Callable[[str, bytes, bool], None]
 """Sends a payload under a key; the last argument says whether it may be dropped where nobody takes it."""
 
 
+class _Message(NamedTuple):
+    number: int
+    """In the order in which all messages came."""
+    id: str
+    payload: bytes
+
+
 class _Waiting:
     """What one consumer, all of its replicas or one of them, has not done with on one port."""
 
     def __init__(self, route: Route) -> None:
         self.route = route
-        self.messages: OrderedDict[str, bytes] = OrderedDict()
-        self.kept: deque[tuple[str, bytes]] = deque(maxlen=route.kept)
+        self.messages: OrderedDict[str, _Message] = OrderedDict()
+        """By id."""
+        self.kept: deque[_Message] = deque(maxlen=route.kept)
         """The newest of what has been used and may be used again."""
         self.offer_at = 0.0
         self.pause = LATEST_SECONDS
 
-    def add(self, id: str, payload: bytes) -> None:
+    def add(self, message: _Message) -> None:
         if self.route.policy == "latest":
             self.messages.clear()
             self.pause = LATEST_SECONDS
             self.offer_at = time.monotonic() + self.pause
-        self.messages[id] = payload
+        self.messages[message.id] = message
 
     def done(self, id: str) -> bool:
-        payload = self.messages.pop(id, None)
-        if payload is not None and self.route.kept:
-            self.kept.append((id, payload))
-        return payload is not None
+        message = self.messages.pop(id, None)
+        if message is not None and self.route.kept:
+            self.kept.append(message)
+        return message is not None
 
 
 class Redelivery:
@@ -61,6 +72,7 @@ class Redelivery:
         ]
         self._open: dict[str, dict[str, tuple[str, ...]]] = {}
         """Causes of the messages, by stage and id, whose step has not come yet."""
+        self._numbers = itertools.count()
         self._recent = Recent[str, None]()
         """Ids of messages that have come lately."""
         self._early = Recent[tuple[str, int, str, str], None]()
@@ -72,6 +84,7 @@ class Redelivery:
         Its publisher has died meanwhile and its successor, which has sent it once more, does not know that.
         """
         id = message.id
+        arrived = _Message(next(self._numbers), id, payload)
         self._open.setdefault(topic.partition("/")[0], {})[id] = message.causes
         known = id in self._recent
         self._recent[id] = None
@@ -81,11 +94,11 @@ class Redelivery:
             if early or (known and id not in waiting.messages):
                 yield place[0], place[2]
             elif not known:
-                waiting.add(id, payload)
+                waiting.add(arrived)
 
     def note_step(self, step: Step) -> None:
-        """Takes a step."""
-        for id in step.emitted:
+        """Takes a step; one that failed is taken again, and emits the same once more."""
+        for id in step.emitted if step.outcome != "failed" else ():
             self._open.get(step.stage, {}).pop(id, None)
         for port, id in answered(step):
             for taker in (step.replica, -1):
@@ -101,13 +114,24 @@ class Redelivery:
     def catch_up(self, process: Process) -> None:
         """Sends a new process all that it has to do: first what its predecessor was in the midst of, then the oldest.
 
-        A step that is taken again in the same order emits the same ids.
+        A step that is taken again in the same order, whatever ports it takes from, emits the same ids.
         """
         begun = {id for causes in self._open.get(process.stage, {}).values() for id in causes}
-        for place, waiting in self._by_place.items():
-            if place[0] == process.stage and place[1] in (process.replica, -1):
-                messages = (*waiting.kept, *waiting.messages.items())
-                self._again(process.replica, waiting, sorted(messages, key=lambda message: message[0] not in begun))
+        waits = [
+            (message.id not in begun, message, waiting)
+            for (stage, taker, _), waiting in self._by_place.items()
+            if stage == process.stage and taker in (process.replica, -1)
+            for message in (*waiting.kept, *waiting.messages.values())
+        ]
+        for _, message, waiting in sorted(waits, key=itemgetter(0, 1)):
+            self._again(process.replica, waiting, [message])
+
+    def undone(self, stage: str) -> Iterator[tuple[str, str, str]]:
+        """(consumer, port, id) of the parts that a stage has sent and nobody has done with, the oldest first."""
+        for topic, edges in self._edges.items():
+            if topic.partition("/")[0] == stage:
+                for (consumer, _, port), waiting in edges.items():
+                    yield from ((consumer, port, id) for id in waiting.messages if waiting.route.shared)
 
     def lost(self, process: Process, living: Iterable[Process]) -> None:
         """Sends what a dead process has published, and nobody has done with, to those who may not have got it."""
@@ -117,7 +141,7 @@ class Redelivery:
                 for (stage, taker, _), waiting in edges.items():
                     for one in replicas:
                         if one.stage == stage and taker in (one.replica, -1):
-                            self._again(one.replica, waiting, waiting.messages.items())
+                            self._again(one.replica, waiting, waiting.messages.values())
 
     def offer_latest(self) -> None:
         """Sends the newest of each edge of policy ``latest`` again that has not been used for a while."""
@@ -126,12 +150,12 @@ class Redelivery:
             if waiting.messages and now > waiting.offer_at:
                 waiting.pause *= 2
                 waiting.offer_at = now + waiting.pause
-                self._again(taker, waiting, waiting.messages.items())
+                self._again(taker, waiting, waiting.messages.values())
 
-    def _again(self, replica: int, waiting: _Waiting, messages: Iterable[tuple[str, bytes]]) -> None:
+    def _again(self, replica: int, waiting: _Waiting, messages: Iterable[_Message]) -> None:
         route = waiting.route
-        for _, payload in messages:
-            self._send(f"again/{route.consumer}/{replica}/{route.input}", payload, route.policy == "latest")
+        for message in messages:
+            self._send(f"again/{route.consumer}/{replica}/{route.input}", message.payload, route.policy == "latest")
 
 
 def _edges(routes: Iterable[Route]) -> Iterator[tuple[tuple[str, int, str], _Waiting]]:

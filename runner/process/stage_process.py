@@ -21,7 +21,7 @@ from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.graph.reading import node_from_entry
 from runner.message import codec
-from runner.message.codec import Deal, Draft, Journal, Lost, Outcome, Step, answered
+from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, Step, answered
 from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
@@ -71,8 +71,6 @@ class Assignment(msgspec.Struct, frozen=True):
     """True where an earlier process has run the start handlers."""
     consumed: tuple[tuple[str, str], ...] = ()
     """(port, id) of the newest that earlier processes have consumed: it may be sent again, and is not worked on."""
-    undone: tuple[tuple[str, str, str], ...] = ()
-    """(consumer, port, id) of the parts that an earlier process has sent and nobody has done with."""
 
 
 class StageProcess:
@@ -98,7 +96,6 @@ class StageProcess:
             self._bus.publish,
             partial(self._bus.log, level="warning"),
             stopping=self._stopping.is_set,
-            undone=task.undone,
         )
         self._refusals = Refusals(partial(self._bus.log, level="error"))
         self._intake = Intake(self._node, self._refusals, consumed=task.consumed, is_new=task.incarnation == 0)
@@ -164,7 +161,7 @@ class StageProcess:
             listen = self._bus.overhear if edge.policy == "latest" else self._bus.hand_over
             listen(f"m/{edge.stage}/{edge.port}", partial(self._intake.came, port))
         self._bus.hand_over(f"again/{own}/*", lambda packet: self._intake.came_again(packet.end, packet))
-        self._bus.hand_over(f"ready/{self._process.path}", lambda _: self._intake.caught_up())
+        self._bus.hand_over(f"ready/{self._process.path}", self._refusals.reading(CaughtUp, self._on_caught_up))
         self._bus.hand_over(f"d/{own}/*", self._refusals.reading(Deal, self._intake.deal))
         self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
@@ -193,6 +190,10 @@ class StageProcess:
             self._delivery.appeared(process)
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
+
+    def _on_caught_up(self, caught_up: CaughtUp, _: Packet) -> None:
+        self._delivery.take_over(caught_up.undone)
+        self._intake.caught_up()
 
     def _on_lost(self, lost: Lost, _: Packet) -> None:
         self._presence.ended(lost.process)

@@ -1,11 +1,10 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
 import signal
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from runner.graph.graph import Limits, Route
+from runner.graph.graph import Limits
 from runner.hosts.head import RemoteChild
 from runner.inspect.info import byte_count
 from runner.message.codec import Pulse, Step, answered
@@ -62,18 +61,14 @@ class Child:
 class Progress:
     """How far a stage has come: what its next process must know."""
 
-    def __init__(self, routes: Iterable[Route]):
-        """``routes`` are the edges that leave the stage."""
+    def __init__(self) -> None:
         self.numbers: dict[str, int] = {}
         """Next sequence number by output port."""
         self.started = False
-        self.undone: dict[tuple[str, str, str], None] = {}
-        """(consumer, port, id) of parts that were sent and not done with."""
-        self._shared = [route for route in routes if route.shared]
         self.consumed = Recent[tuple[str, str], None]()
         """(port, id) of what the stage has done with lately."""
 
-    def note(self, step: Step, consumers: Mapping[str, "Progress"]) -> None:
+    def note(self, step: Step) -> None:
         """Takes a step that the recorder has; only what was done counts."""
         for key in answered(step):
             self.consumed[key] = None
@@ -83,6 +78,3 @@ class Progress:
         for id in step.emitted:
             one = MessageId.of(id)
             self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
-            for route in self._shared:
-                if route.output == one.port and (route.input, id) not in consumers[route.consumer].consumed:
-                    self.undone[route.consumer, route.input, id] = None

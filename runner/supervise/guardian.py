@@ -9,7 +9,7 @@ from runner.contract import EXIT_REFUSED, Level, Refused, Restarted
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
-from runner.message.codec import Step, answered
+from runner.message.codec import Step
 from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
@@ -79,7 +79,7 @@ class Guardian:
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
-        self._progress = {stage: Progress(run.graph.routes(stage)) for stage in (*run.graph.nodes, SUPERVISOR)}
+        self._progress = {stage: Progress() for stage in (*run.graph.nodes, SUPERVISOR)}
         self.pulses = Pulses()
         """Signs of life; whoever hears one notes it."""
         self.settled: set[Process] = set()
@@ -195,10 +195,7 @@ class Guardian:
         """Takes a step that the recorder has."""
         if step.outcome == "ended":
             self._ended.add(step.process)
-        self._progress[step.stage].note(step, self._progress)
-        for port, id in answered(step):
-            if (edge := self._graph.nodes[step.stage].inputs.get(port)) is not None:
-                self._progress[edge.stage].undone.pop((step.stage, port, id), None)
+        self._progress[step.stage].note(step)
 
     def note_presence(self, process: Process, present: bool) -> None:
         """Takes note of a process that came or went; says when it is ready, and when all are."""

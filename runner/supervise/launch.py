@@ -130,7 +130,6 @@ class Launcher:
             numbers=progress.numbers,
             started=progress.started,
             consumed=tuple(progress.consumed)[-RESENT:],
-            undone=tuple(progress.undone),
             gateway=run.gateway,
             network=run.network,
             past=str(run.recording.absolute()) if has_past else "",

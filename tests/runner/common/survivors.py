@@ -16,7 +16,7 @@ import psutil
 from numpy.typing import NDArray
 
 from runner.contract import Context, Finished, Message, Refused, Restarted, Spec, Stage
-from tests.runner.common.toys import Answer, Double, Number, Piece
+from tests.runner.common.toys import Answer, Double, Number, Piece, Splitter
 
 
 class Troubled(Stage):
@@ -113,6 +113,14 @@ class FragileSplitter(Stage):
                 and first_time(self._config.marks / str(number.value))
             ):
                 os.kill(os.getpid(), signal.SIGKILL)
+
+
+class SlowSplitter(Splitter):
+    """Takes a second to start: its predecessor's pieces are worked on meanwhile."""
+
+    def __init__(self, config: Splitter.Config):
+        time.sleep(1.0)
+        super().__init__(config)
 
 
 class Adder(Stage):

@@ -34,7 +34,7 @@ from runner.supervise.registry import Entry, Registration, find_run, runs
 from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
 from runner.transport.session import new_endpoint, runtime_folder
-from tests.runner.common.runs import ACCOUNT, TOYS, finish, processes_of
+from tests.runner.common.runs import ACCOUNT, TOYS, changed, finish, processes_of
 from tests.runner.common.runs import Run as Finished
 from tests.runner.common.toys import Sum
 from tests.runner.common.waiting import wait_until
@@ -356,6 +356,19 @@ def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) ->
     assert {step.outcome for step in steps if step.replica == 1 and step.incarnation == 0} == {"done"}
     pieces = [id for step in steps for port, id in step.consumed if port == "piece"]
     assert len(pieces) == len(set(pieces)) == 240
+
+
+def test_parts_that_are_done_while_their_publisher_is_replaced_block_no_replica(tmp_path: Path) -> None:
+    settings = ("counter.count=12", "counter.period=0.05", "worker.seconds=0.2", f"sink.path={tmp_path / 'out.txt'}")
+    run = Run(tmp_path, changed(TOYS, tmp_path, Splitter="SlowSplitter"), *settings)
+    with Live(run.entry) as live:
+        for _ in range(2):
+            wait_until((tmp_path / "out.txt").exists)
+            time.sleep(0.3)
+            assert "splitter is back" in live.restart("splitter")
+    finished = run.finish()
+    assert (finished.code, len(finished.result)) == (0, 12), finished.output
+    assert Recording(finished.recording).verdict.complete
 
 
 # ------------------------------------------------------------------------------------------ as a user types it

@@ -43,12 +43,12 @@ class Wire:
         return dealt
 
 
-def make(undone: tuple[tuple[str, str, str], ...] = (), **changes: Any) -> tuple[Delivery, Wire]:
+def make(**changes: Any) -> tuple[Delivery, Wire]:
     route = Route("number", "worker", "input", "block", queue=4, shared=False, kept=0)
     wire = Wire()
     routes = [msgspec.structs.replace(route, **changes)]
     stopping = wire.stopping.is_set
-    return Delivery("counter", routes, wire.publish, lambda _: None, stopping=stopping, undone=undone), wire
+    return Delivery("counter", routes, wire.publish, lambda _: None, stopping=stopping), wire
 
 
 def unanswered(delivery: Delivery) -> list[int]:
@@ -112,7 +112,8 @@ def test_a_death_that_is_heard_of_late_takes_nothing_from_the_successor():
 
 
 def test_a_successor_deals_what_its_predecessor_has_sent():
-    delivery, wire = make((("worker", "input", "counter.number#7"),), shared=True)
+    delivery, wire = make(shared=True)
+    delivery.take_over([("worker", "input", "counter.number#7")])
     delivery.appeared(Process("worker", 0))
     assert wire.take(1) == [(0, "counter.number#7")]
 
@@ -186,8 +187,9 @@ def publish(key, payload):
     raise MemoryError("no room to deal")
 
 route = Route("number", "worker", "input", "block", queue=4, shared=True, kept=0)
-undone = [("worker", "input", "counter.number#0")]
-Delivery("counter", [route], publish, print, stopping=bool, undone=undone).appeared(Process("worker", 0))
+delivery = Delivery("counter", [route], publish, print, stopping=bool)
+delivery.take_over([("worker", "input", "counter.number#0")])
+delivery.appeared(Process("worker", 0))
 time.sleep(60)
 """
 

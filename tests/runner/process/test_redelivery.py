@@ -69,6 +69,33 @@ def test_what_a_process_was_in_the_midst_of_comes_first():
     assert recorder.take() == [("0", first), ("0", second)]
 
 
+@pytest.mark.parametrize("failed", [False, True])
+def test_what_a_process_was_in_the_midst_of_comes_first_whatever_port_it_came_by(failed: bool):
+    """A step that failed is no end of it: it is taken again."""
+    sent: list[tuple[str, bytes]] = []
+    routes = {f"counter/{port}": (Route(port, "worker", port, "block", 4, False, 0),) for port in ("a", "b")}
+    redelivery = Redelivery(routes, lambda key, payload, _: sent.append((key, payload)))
+    for id in ("counter.a#0", "counter.b#0", "counter.a#1", "counter.b#1"):
+        envelope = Envelope(id, id, 0, "Number", 1, (), msgspec.Raw(b""))
+        list(redelivery.note_message(id.partition("#")[0].replace(".", "/"), envelope, id.encode()))
+    answer = Envelope("worker.answer#0", "counter.b#0", 0, "Answer", 1, ("counter.b#0",), msgspec.Raw(b""))
+    list(redelivery.note_message("worker/answer", answer, b""))
+    if failed:
+        consumed = (("b", "counter.b#0"),)
+        redelivery.note_step(Step("worker", 0, 0, 0, "on_b", consumed, (answer.id,), 0, 0, 0, 0, outcome="failed"))
+    redelivery.catch_up(Process("worker", 0, 1))
+    assert [payload.decode() for _, payload in sent] == ["counter.b#0", "counter.a#0", "counter.a#1", "counter.b#1"]
+    assert [key.rpartition("/")[2] for key, _ in sent] == ["b", "a", "a", "b"]
+
+
+def test_a_new_publisher_is_told_which_parts_are_still_to_be_done():
+    recorder = Recorder(replicas=2, shared=True)
+    first, second, third = (recorder.message(number)[0] for number in range(3))
+    recorder.step(second, replica=1)
+    assert list(recorder.redelivery.undone("counter")) == [("worker", "input", first), ("worker", "input", third)]
+    assert list(recorder.redelivery.undone("worker")) == []
+
+
 def test_what_a_dead_publisher_has_sent_is_sent_to_who_may_lack_it():
     recorder = Recorder(replicas=2)
     first, second = (recorder.message(number)[0] for number in range(2))
