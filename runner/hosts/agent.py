@@ -31,7 +31,7 @@ from runner.hosts.head import (
     introduce,
     network_of,
 )
-from runner.message.packet import Process
+from runner.message.packet import Packet, Process
 from runner.process.children import Descendants, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.terminal import Terminal
@@ -90,10 +90,16 @@ class Agent:
             self._end_all()
             self._bus.close()
 
+    def _on_order(self, packet: Packet) -> None:
+        try:
+            self._events.put(msgspec.json.decode(packet.payload, type=Order))
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            self._say(f"an order is refused: {error}")
+
     def _take_part(self) -> Dismiss:
         """Raises Refused with the head's reason where it does not take this host in."""
         path = f"order/{self._host}/{self._session}"
-        self._bus.subscribe(path, lambda packet: self._events.put(msgspec.json.decode(packet.payload, type=Order)))
+        self._bus.subscribe(path, self._on_order)
         self._bus.watch(self._on_presence)
         self._bus.announce()
         while not self._head_is_there:

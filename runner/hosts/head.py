@@ -13,6 +13,7 @@ Head and hosts talk below ``hosts/GRAPH/`` beside the run, whose id a host learn
 
 from __future__ import annotations
 
+import contextlib
 import math
 import secrets
 import signal
@@ -150,10 +151,10 @@ class RemoteChild(Handle):
         self.send_signal(signum, group=True)
 
     def end(self, code: int, output: str) -> None:
-        """Takes note that it has gone; its last words are kept where those of other processes are."""
-        with self._log.open("a") as log:
-            log.write(output)
+        """Takes note that it has gone; its last words are kept where those of other processes are, if there is room."""
         self.returncode = code
+        with contextlib.suppress(OSError), self._log.open("a") as log:
+            log.write(output)
 
 
 @dataclass(slots=True)
@@ -285,12 +286,18 @@ class Hosts:
         with self._changed:
             if place is None or place.hello is None or str(place.hello.session) != session:
                 return
-            report: Report = msgspec.json.decode(packet.payload, type=Report)
+            try:
+                report: Report = msgspec.json.decode(packet.payload, type=Report)
+            except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+                self._say(f"a report of host {host} is refused: {error}", "warning")
+                return
             match report:
-                case Started(process, pid):
+                case Started(process, pid) if process in place.children:
                     place.children[process].pid = pid
-                case Ended(process, code, output):
+                case Ended(process, code, output) if process in place.children:
                     place.children.pop(process).end(code, output)
+                case _:
+                    pass
 
     def _lose(self, place: _Place) -> None:
         """Counts everything on a host as gone; what cannot be started elsewhere is started when it is back."""

@@ -6,12 +6,11 @@ import contextlib
 from pathlib import Path
 
 import msgspec
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
 from runner.contract import Refused
-from runner.recording.container import Container, is_being_written
+from runner.recording.container import BROKEN, Container, is_being_written
 from runner.recording.recording import RUN, VERDICT
 
 
@@ -57,7 +56,7 @@ def _read(path: Path) -> PastRun | None:
             reader = make_reader(file)
             summary = reader.get_summary()
             said = {record.name: record.metadata for record in reader.iter_metadata()}
-    except (McapError, OSError, ValueError):
+    except (*BROKEN, OSError):
         return None
     statistics = summary.statistics if summary else None
     start, end = (statistics.message_start_time, statistics.message_end_time) if statistics else (0, 0)

@@ -13,10 +13,16 @@ from runner.process.step import Executor, receive, step_time
 from runner.recording.recording import Recording
 
 
-def past_of(recording: Recording, stage: str, incarnation: int) -> list[Step]:
-    """What earlier incarnations of a stage have done, in that order. What they failed at has left nothing."""
+def past_of(recording: Recording, stage: str, incarnation: int, *, done: int) -> list[Step]:
+    """What earlier incarnations of a stage have done, in that order. What they failed at has left nothing.
+
+    Raises Refused where fewer than the ``done`` steps are recorded.
+    """
     steps = (step for step in recording.steps if step.stage == stage and step.outcome == "done")
     past = {(step.incarnation, step.number): step for step in steps if step.incarnation < incarnation}
+    if len(past) < done:
+        lacking = f"{len(past)} of {done} steps are recorded in {recording.path}"
+        raise Refused(f"{stage} cannot be brought back to where it was: {lacking}")
     return [past[key] for key in sorted(past)]
 
 

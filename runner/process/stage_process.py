@@ -65,6 +65,8 @@ class Assignment(msgspec.Struct, frozen=True):
     """None on one machine."""
     past: str = ""
     """Recording from which a stateful stage gets back what its earlier processes knew; empty for others."""
+    done: int = 0
+    """Steps that its earlier processes have done."""
     numbers: dict[str, int] = {}
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
@@ -83,7 +85,7 @@ class StageProcess:
         self._stage = self._node.construct()
         if task.past:
             recording = Recording(Path(task.past))
-            steps = past_of(recording, task.stage, task.incarnation)
+            steps = past_of(recording, task.stage, task.incarnation, done=task.done)
             bring_back(self._node, self._stage, task.seed, recording, steps)
         self._process = Process(task.stage, task.replica, task.incarnation)
         self._bus = Bus(task.run, task.endpoint, gateway=task.gateway, network=task.network, process=self._process)

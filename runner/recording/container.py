@@ -29,7 +29,7 @@ _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 """What then stands before a message's payload: channel, sequence, log and publish time."""
 
-_BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
+BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
 """What the MCAP reader and its decompressors raise on bytes that make no sense."""
 
 
@@ -71,7 +71,7 @@ class Container:
             except StopIteration:
                 self.torn = False
                 return
-            except _BROKEN as error:
+            except BROKEN as error:
                 if offset == 0 and self._stream.tell() <= 8:
                     foreign = isinstance(error, InvalidMagic)
                     what = "not an MCAP file" if foreign else "empty or cut off in its first bytes"
@@ -87,7 +87,7 @@ class Container:
         while (at := file.tell()) < (offset + 1 if end is None else end):
             try:
                 record = next(records, None)
-            except _BROKEN as error:
+            except BROKEN as error:
                 self._note(at, _reason(error))
                 return
             if record is None:
@@ -115,12 +115,12 @@ class Container:
             return _content(chunk, checked=True)
         except CRCValidationError:
             self._note(offset, "the chunk's checksum does not match its content")
-        except _BROKEN as error:
+        except BROKEN as error:
             self._note(offset, f"the chunk cannot be opened: {_reason(error)}")
             return ()
         try:
             return _content(chunk, checked=False)
-        except _BROKEN as error:
+        except BROKEN as error:
             self._note(offset, f"the chunk cannot be read: {_reason(error)}")
             return ()
 

@@ -65,6 +65,8 @@ class Progress:
         self.numbers: dict[str, int] = {}
         """Next sequence number by output port."""
         self.started = False
+        self.done = 0
+        """Steps that were done."""
         self.consumed = Recent[tuple[str, str], None]()
         """(port, id) of what the stage has done with lately."""
 
@@ -74,6 +76,7 @@ class Progress:
             self.consumed[key] = None
         if step.outcome != "done":
             return
+        self.done += 1
         self.started |= not step.consumed
         for id in step.emitted:
             one = MessageId.of(id)

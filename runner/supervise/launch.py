@@ -133,6 +133,7 @@ class Launcher:
             gateway=run.gateway,
             network=run.network,
             past=str(run.recording.absolute()) if has_past else "",
+            done=progress.done,
         )
 
     def close(self) -> list[str]:

@@ -139,7 +139,7 @@ class Bus:
         self._declare(self._listener or self._session, path, self._taker(take))
 
     def _taker(self, take: Callable[[Packet], None]) -> Callback[zenoh.Sample]:
-        return Callback(lambda sample: None if _is_wide(sample) else take(self._packet(sample)), indirect=False)
+        return Callback(lambda sample: None if _is_stray(sample) else take(self._packet(sample)), indirect=False)
 
     def channel(self, path: str) -> Callable[[], Iterator[Packet]]:
         """Takes all that has been sent to ``path`` by others, whenever it is called; when it came is not known.
@@ -150,7 +150,7 @@ class Bus:
 
         def take() -> Iterator[Packet]:
             while (sample := subscriber.try_recv()) is not None:
-                if not _is_wide(sample):
+                if not _is_stray(sample):
                     yield Packet(self._path(sample), sample.payload.to_bytes(), 0, 0)
 
         return take
@@ -216,7 +216,7 @@ class Bus:
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             for reply in self._session.get(f"{self._run}/q/{name}", payload=question, timeout=left):
-                if reply.ok is not None and not _is_wide(reply.ok):
+                if reply.ok is not None and not _is_stray(reply.ok):
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None and reply.err.encoding == REFUSAL:
                     raise Refused(reply.err.payload.to_string())
@@ -249,9 +249,10 @@ def _reply(query: zenoh.Query, key: str, answer: Callable[[bytes], bytes]) -> No
             query.reply_err(f"{type(error).__name__}: {error}", encoding=REFUSAL)
 
 
-def _is_wide(sample: zenoh.Sample) -> bool:
-    """Whether it was sent to many keys at once: nobody here does, and rules on who may speak do not hold for it."""
-    return "*" in str(sample.key_expr)
+def _is_stray(sample: zenoh.Sample) -> bool:
+    """Whether it says that a key is to be deleted, or was sent to many keys at once, for which rules on who may speak
+    do not hold: nobody here does either."""
+    return sample.kind != zenoh.SampleKind.PUT or "*" in str(sample.key_expr)
 
 
 def _sent_ns(sample: zenoh.Sample) -> int:

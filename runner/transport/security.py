@@ -60,7 +60,7 @@ def _hosts(network: Network) -> tuple[list[Any], list[Any], dict[str, list[str]]
     """Rules, who there is, and which rules hold for whom: all take part, and only the head orders and answers."""
     rules = [
         _rule("take part", "allow", EVERYTHING, ("ingress", "egress"), "**"),
-        _rule("give orders", "deny", ("put",), ("ingress",), ORDERS),
+        _rule("give orders", "deny", ("put", "delete"), ("ingress",), ORDERS),
         _rule("answer", "deny", ("declare_queryable", "reply"), ("ingress",), QUESTIONS),
     ]
     subjects = [{"id": "hosts", "cert_common_names": list(network.hosts)}]

@@ -13,7 +13,7 @@ from runner.cli.main import main
 from runner.contract import EXIT_REFUSED
 from runner.graph.document import read_document
 from runner.graph.placement import Host, read_layout
-from runner.hosts.head import Dismiss, Hello, Start, control, network_of
+from runner.hosts.head import Dismiss, Hello, RemoteChild, Start, control, network_of
 from runner.hosts.keys import make_keys
 from runner.message.packet import Process
 from runner.process.stage_process import Assignment
@@ -200,6 +200,13 @@ def test_a_host_that_is_started_again_takes_part_again(here: Run, parties, tmp_p
     head = party.end("head", before)
     assert "host worker1 is back" in head.output
     assert_same_result(head, here)
+
+
+def test_a_process_elsewhere_has_gone_even_where_its_last_words_cannot_be_kept():
+    """The disk is full."""
+    child = RemoteChild(Process("worker", 0), Path("/dev/full"), lambda order: None, lambda: None)
+    child.end(1, "last words")
+    assert child.poll() == 1
 
 
 @pytest.mark.slow

@@ -195,6 +195,7 @@ def test_only_the_head_gives_orders(meeting: Meeting, key: str):
 
     def all_arrived() -> bool:
         meeting.stranger.put(key, b"from worker2")
+        meeting.stranger.delete(key)
         meeting.other.publish("report/worker2/1", b"from worker2")
         meeting.head.publish("order/worker1/1", b"from the head")
         return b"from the head" in orders and b"from worker2" in reports
