@@ -67,13 +67,13 @@ class Progress:
         self.started = False
         self.done = 0
         """Steps that were done."""
-        self.consumed = Recent[tuple[str, str], None]()
-        """(port, id) of what the stage has done with lately."""
+        self.consumed = Recent[tuple[int, str, str], None]()
+        """(replica, port, id) of what the stage has done with lately."""
 
     def note(self, step: Step) -> None:
         """Takes a step that the recorder has; only what was done counts."""
-        for key in answered(step):
-            self.consumed[key] = None
+        for port, id in answered(step):
+            self.consumed[step.replica, port, id] = None
         if step.outcome != "done":
             return
         self.done += 1

@@ -115,13 +115,19 @@ class Launcher:
 
     def _assignment(self, process: Process, progress: Progress) -> Assignment:
         run = self._run
+        node = run.graph.nodes[process.stage]
+        consumed = [
+            (port, id)
+            for replica, port, id in progress.consumed
+            if replica == process.replica or (port in node.inputs and node.shares(port))
+        ]
         has_past = process.incarnation > 0 and run.remembers(process.stage)
         return Assignment(
             run=run.id,
             endpoint=run.endpoint,
             directory=str(run.directory.absolute()),
             stage=process.stage,
-            entry=node_entry(run.graph.nodes[process.stage]),
+            entry=node_entry(node),
             seed=run.graph.seed,
             routes=tuple(run.graph.routes(process.stage)),
             processes=tuple(run.graph.processes()),
@@ -129,7 +135,7 @@ class Launcher:
             incarnation=process.incarnation,
             numbers=progress.numbers,
             started=progress.started,
-            consumed=tuple(progress.consumed)[-RESENT:],
+            consumed=tuple(consumed[-RESENT:]),
             gateway=run.gateway,
             network=run.network,
             past=str(run.recording.absolute()) if has_past else "",

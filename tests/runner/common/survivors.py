@@ -16,7 +16,7 @@ import psutil
 from numpy.typing import NDArray
 
 from runner.contract import Context, Finished, Message, Refused, Restarted, Spec, Stage
-from tests.runner.common.toys import Answer, Double, Number, Piece, Splitter
+from tests.runner.common.toys import Answer, Double, Number, Piece, Splitter, Worker
 
 
 class Troubled(Stage):
@@ -113,6 +113,15 @@ class FragileSplitter(Stage):
                 and first_time(self._config.marks / str(number.value))
             ):
                 os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Listener(Worker):
+    """Hears numbers besides its pieces; the first of its processes to hear a three dies of it a little later."""
+
+    def on_heard(self, heard: Number, ctx: Context) -> None:
+        if heard.value == 3 and first_time(ctx.directory / "heard"):
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 class SlowSplitter(Splitter):

@@ -177,6 +177,20 @@ def test_who_replaces_the_dead_waits_for_none_of_them(tmp_path: Path):
     assert Recording(ended.recording).verdict.complete
 
 
+def test_a_successor_hears_what_every_replica_is_to_hear_though_another_one_has_heard_it(tmp_path: Path):
+    graph = changed(TOYS, tmp_path, Worker="Listener")
+    pieces = "      piece: splitter.piece\n"
+    graph.write_text(graph.read_text().replace(pieces, f"{pieces}      heard: counter.number\n"))
+    ended = run(graph, tmp_path, "counter.count=60", "counter.period=0.05")
+    assert (ended.code, len(ended.result)) == (0, 60), ended.output
+    assert len(re.findall(r"worker\.\d restarts \(1 of 3\): killed by SIGKILL", ended.output)) == 1, ended.output
+    recording = Recording(ended.recording)
+    assert recording.verdict.complete, recording.verdict
+    steps = [step for step in recording.steps if step.stage == "worker" and step.outcome == "done"]
+    heard = [(step.replica, id) for step in steps for port, id in step.consumed if port == "heard"]
+    assert len(heard) == len(set(heard)) == 120
+
+
 @pytest.mark.parametrize("way", ["quit", "interrupt"])
 def test_a_handler_that_leaves_the_process_has_failed(tmp_path: Path, way: str):
     left = run(changed(DOUBLES, tmp_path, Doubler="Quitter"), tmp_path, f"doubler.way={way}")
