@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from runner.contract import Refused
 from runner.process.children import ENVIRONMENT, bound
 
+END_SECONDS = 5.0
 NEEDED = ("PIL", "starlette", "uvicorn", "websockets")
 
 
@@ -42,4 +43,7 @@ def page_beside(run: str, say: Callable[[str], object]) -> Generator[subprocess.
         yield page
     finally:
         page.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            page.wait(END_SECONDS)
+        page.kill()
         page.wait()

@@ -40,6 +40,8 @@ DESCENDANT_DEATH_SECONDS = 3.0
 """After that one is given up: the kernel holds it."""
 LOOK_SECONDS = 0.01
 """Between two looks for descendants. Two must find none: one that is just replaced by another program shows nothing."""
+DEATH_SECONDS = 3.0
+"""What a killed process may take until it has gone."""
 LONGEST_PAUSE_SECONDS = 0.02
 """Between two looks whether a process has ended."""
 SHOWN_CHARACTERS = 100
@@ -80,11 +82,14 @@ class Handle(Protocol):
 
 
 def end_process(handle: Handle, seconds: float) -> None:
-    """Waits for the end of a process, and kills it where that does not come, and whatever it has left behind."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        handle.wait(seconds)
-    handle.signal_group(signal.SIGKILL)
-    handle.wait()
+    """Waits for the end of a process, and kills it where that does not come, and whatever it has left behind.
+
+    One that waits for a device or a disk which does not answer cannot be killed, and is left.
+    """
+    for patience in (seconds, DEATH_SECONDS):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            handle.wait(patience)
+        handle.signal_group(signal.SIGKILL)
 
 
 class Spawned(subprocess.Popen[bytes]):

@@ -21,6 +21,8 @@ import msgspec
 from runner.process.children import DESCENT, PARENT, Handle, die_with_parent, ending, origin, spawn
 from runner.process.forks import Forked, Threads, fork, refuse_threads
 
+PREPARE_SECONDS = 180.0
+"""How long the fork server may prepare a process."""
 _PR_SET_CHILD_SUBREAPER = 36
 
 
@@ -82,7 +84,10 @@ class ForkServer:
         try:
             with self._asking, _adopting():
                 self._connection.send_bytes(msgspec.msgpack.encode(order))
-                answer = msgspec.msgpack.decode(self._connection.recv_bytes(), type=int | str)
+                if self._connection.poll(PREPARE_SECONDS):
+                    answer = msgspec.msgpack.decode(self._connection.recv_bytes(), type=int | str)
+                else:
+                    answer = f"the fork server has not started {order.name} after {PREPARE_SECONDS:g} s"
         except (EOFError, OSError):
             answer = f"the fork server {ending(server.wait())}"
         if isinstance(answer, int):

@@ -36,6 +36,8 @@ LOOK_SECONDS = 0.01
 """The same at the end, when somebody waits."""
 DUMP_SECONDS = 0.5
 """What a hung process gets to print where it hangs before it is killed."""
+UNENDING_SECONDS = 15.0
+"""How long after it is killed a process may still be there."""
 SETTLE_SECONDS = 30.0
 """How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
 RETIRE_SECONDS = 30.0
@@ -122,6 +124,9 @@ class Guardian:
         for child in list(self._children.values()):
             if child.handle.poll() is None:
                 self._check(child)
+                if time.monotonic() > child.dies_at + UNENDING_SECONDS:
+                    name = self._run.name_of(child.process)
+                    return End(1, f"{name} cannot be ended: {child.killed_because}; it waits for a device or a disk")
             elif child.process not in self._ready and time.monotonic() < child.dead_since + SEEN_SECONDS:
                 child.dead_since = min(child.dead_since, time.monotonic())  # it may have been ready, and not seen yet
             elif child.replaced_because:

@@ -10,6 +10,7 @@ from typing import ClassVar
 import msgspec
 
 from runner.contract import Stage
+from runner.process.children import Handle, end_process
 from runner.process.forks import clean_environment
 from runner.process.stage_process import Assignment, prepare
 from tests.runner.common.survivors import lives
@@ -172,6 +173,34 @@ forks.close()
     assert (code, living, later) == (4, None, [6, 1])
     assert said == ["the fork server killed by SIGKILL; from now on every process imports what it needs by itself"]
     assert (tmp_path / "second.txt").read_text() == "started\n"
+
+
+def test_a_fork_server_that_stands_still_is_not_waited_for_without_end(tmp_path: Path):
+    script = """
+import runner.process.fork_server
+runner.process.fork_server.PREPARE_SECONDS = 1.0
+os.kill(server(), signal.SIGSTOP)
+show(start("code = 4", "second").wait(), said)
+forks.close()
+"""
+    ((code, said),) = shown(tmp_path, script)
+    reason = "the fork server has not started second after 1 s"
+    assert (code, said) == (4, [f"{reason}; from now on every process imports what it needs by itself"])
+
+
+class Unkillable(Handle):
+    """A process that waits for a disk that does not answer: signals change nothing."""
+
+    pid, returncode = 2**22, None
+
+    def poll(self) -> None:
+        """It is always there."""
+
+
+def test_a_process_that_cannot_be_killed_is_left():
+    left = Unkillable()
+    end_process(left, 0.1)
+    assert left.poll() is None
 
 
 def test_a_process_with_threads_is_not_forked(tmp_path: Path):
