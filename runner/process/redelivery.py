@@ -85,8 +85,9 @@ class Redelivery:
         """
         id = message.id
         arrived = _Message(next(self._numbers), id, payload)
-        self._open.setdefault(topic.partition("/")[0], {})[id] = message.causes
-        known = id in self._recent
+        unfinished = self._open.setdefault(topic.partition("/")[0], {})
+        known = id in self._recent or id in unfinished
+        unfinished[id] = message.causes
         self._recent[id] = None
         for place, waiting in self._edges.get(topic, {}).items():
             early = (*place, id) in self._early

@@ -14,7 +14,6 @@ from runner.message.packet import RECORDER, Process
 from runner.process.children import DUMP, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
-from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.child import Child, Progress
 from runner.supervise.launch import Launcher, Run
 from runner.supervise.status import ProcessStatus, Pulses
@@ -175,14 +174,11 @@ class Guardian:
         return "" if self._recorder is None else self._recorder.reason()
 
     def _report_lost(self, child: Child) -> None:
-        """Says that a process has ended without having journalled that."""
-        if child.handle.poll() is None or child.reported:
-            return
-        if child.handle.returncode == 0 and not child.killed_because and child.process in self._ready:
-            deadline = time.monotonic() + RECORDED_SECONDS
-            while child.process not in self._ended and time.monotonic() < deadline:
-                time.sleep(LOOK_SECONDS)
-        if child.process not in self._ended:
+        """Says that a process has ended otherwise than in order; where it has, the recorder has its own word, or lacks
+        it, and then the recording is not complete."""
+        code = child.handle.poll()
+        in_order = code == 0 and not child.killed_because and child.process in self._ready
+        if code is not None and not (child.reported or in_order or child.process in self._ended):
             self._lose(child, child.reason(self.pulses.newest(child.process)))
 
     def _lose(self, child: Child, reason: str) -> None:

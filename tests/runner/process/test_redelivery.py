@@ -88,6 +88,17 @@ def test_what_a_process_was_in_the_midst_of_comes_first_whatever_port_it_came_by
     assert [key.rpartition("/")[2] for key, _ in sent] == ["b", "a", "a", "b"]
 
 
+def test_what_a_step_that_is_not_over_has_emitted_is_known_however_long_ago_that_was():
+    """It has been worked on since, and its emitter died and has emitted it once more."""
+    recorder = Recorder()
+    first, _ = recorder.message(0)
+    recorder.step(first)
+    for number in range(1, REMEMBERED + 2):
+        id, _ = recorder.message(number)
+        recorder.step(id)
+    assert recorder.message(0) == (first, [("worker", "input")])
+
+
 def test_a_new_publisher_is_told_which_parts_are_still_to_be_done():
     recorder = Recorder(replicas=2, shared=True)
     first, second, third = (recorder.message(number)[0] for number in range(3))
