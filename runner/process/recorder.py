@@ -34,8 +34,8 @@ TICK_SECONDS = 0.25
 """How often it is seen whether the supervisor is still there."""
 ORPHANED = signal.SIGUSR1
 """From the kernel, when the supervisor dies: an end that it asks for comes as SIGTERM."""
-ORPHANED_SECONDS = 5.0
-"""What stages may take to die with their supervisor before a recorder that outlives it stops waiting for them."""
+HEAR_OUT_SECONDS = 5.0
+"""How long the recorder waits at the end for links of stages to close: all that they have sent has come then."""
 LAST_RESORT_SECONDS = 30
 """After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
@@ -100,7 +100,9 @@ class Recorder:
             self._hear(*sorted({f"m/{topic.partition('/')[0]}/*" for topic in self._manifest.topics}))
             self._bus.announce()
         if self._wait_for_the_end():
-            self._outlive()
+            signal.alarm(LAST_RESORT_SECONDS)
+            self._writer.note_problem("the supervisor died")
+        self._hear_out()
         self._heartbeat.stop()
         self._ended.set()
         self._taker.join()
@@ -124,13 +126,15 @@ class Recorder:
                 return self._ends.get(timeout=TICK_SECONDS)
         return True
 
-    def _outlive(self) -> None:
-        """The stages die with the supervisor; what they have said until then is recorded."""
-        signal.alarm(LAST_RESORT_SECONDS)
-        deadline = time.monotonic() + ORPHANED_SECONDS
-        while self._presence.living and time.monotonic() < deadline:
+    def _hear_out(self) -> None:
+        """The stages have ended, or die with the supervisor; what they have said until then is recorded."""
+        deadline = time.monotonic() + HEAR_OUT_SECONDS
+        while self._hears_stages and time.monotonic() < deadline:
             time.sleep(TICK_SECONDS / 5)
-        self._writer.note_problem("the supervisor died")
+
+    @property
+    def _hears_stages(self) -> bool:
+        return any(one.place in self._manifest.processes for one in self._presence.living)
 
     def _or_end(self, work: Callable[[], None]) -> None:
         """Does a thread's work; what it raises ends the recording, which says so: the graph would wait for ever."""
