@@ -16,7 +16,7 @@ from stages.perception.hypotheses.unexplained import is_contradicted, looked_thr
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
-from stages.scene.doubts import SURE, is_below
+from stages.scene.doubts import SURE, UNSURE, is_below
 from stages.scene.naming import Named, names_kept, unique_names
 from stages.scene.stance import TIPPED, Stances, standing_of, turned
 
@@ -171,7 +171,8 @@ def _surer(item: SceneObject, other: SceneObject) -> bool:
 
 
 def _clearer(stranger: SceneObject, before: SceneObject) -> bool:
-    """Whether what is seen now is believed rather than what was seen before in its place."""
+    """Whether what is seen now is believed rather than what was seen before in its place; of two doubtful guesses it is
+    the likelier one, as at what shows a few pixels under a box."""
     if stranger.probability is not None and stranger.probability >= SURE:
         return is_below(before, SURE) or stranger.visible >= before.visible
-    return stranger.visible > _CLEARER * before.visible
+    return stranger.visible > _CLEARER * before.visible or (is_below(before, UNSURE) and _surer(stranger, before))

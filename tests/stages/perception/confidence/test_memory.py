@@ -97,6 +97,9 @@ def test_what_was_taken_for_a_stranger_is_what_stood_there() -> None:
         (1.0, 0.95, None, False),
         (1.0, 0.95, 0.99, False),
         (1.0, 0.95, 0.88, True),
+        (1.0, 0.56, 0.22, True),
+        (1.0, 0.20, 0.22, False),
+        (1.0, 0.60, 0.55, False),
     ],
 )
 def test_a_stranger_of_which_more_shows_or_that_is_surer_is_believed(
