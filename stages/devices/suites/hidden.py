@@ -21,6 +21,7 @@ _WIDE = ("sponge", "tea_box", "bowl")
 class Hidden(Drawn):
     """4 to 7 objects, of which one or two are hidden when the work begins."""
 
+    needed = (FIXED[0], *_TALL, *_LOW, *_WIDE)
     hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 1.0}
 
     def choose(self, rng: np.random.Generator) -> None:

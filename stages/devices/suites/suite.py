@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from runner.contract import Refused
 from stages.devices.simulation import Factors, Simulation
 from stages.devices.suites.draft import Draft, shapes
 from stages.devices.tabletop import HIDDEN, Layout, least_shown
 from stages.geometry.arrays import Floats
 from stages.robots import Robot, Table
-from stages.scene.catalogue import Catalogue
+from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.stance import Standing
 
 Kind = Literal["goal", "start"]
@@ -67,10 +68,13 @@ _SHOWN = 0.05
 class Drawn(Suite):
     """A suite whose scenes are put together object by object, as a draft; nothing in them is written by hand."""
 
+    needed: ClassVar[tuple[str, ...]] = ("tray",)
+    """Labels that the catalogue must have."""
     hidden: ClassVar[dict[Kind, float]] = {"goal": HIDDEN, "start": 0.8}
     """Largest share of an object that others in front of it hide from the camera."""
 
     def __init__(self, catalogue: Catalogue, robot: Robot, seed: int) -> None:
+        need(type(self).__name__.lower(), self.needed, catalogue)
         self.catalogue, self.robot, self.table, self._shapes = catalogue, robot, robot.table, shapes(catalogue)
         self._goal: Draft | None = None
         """The newest: what a start must leave room for."""
@@ -123,6 +127,16 @@ class Drawn(Suite):
         """What the hand cannot take, where the goal has it."""
         placed = self._goal.placed if self._goal is not None else {}
         return {name: item for name, item in placed.items() if not item.stance.item.grasps}
+
+
+def need(suite: str, labels: Iterable[str], catalogue: Catalogue) -> None:
+    """Raises Refused where the catalogue lacks labels of which a suite makes its scenes, or all that can be moved."""
+    missing = [label for label in labels if label not in catalogue.objects]
+    if missing or not graspable(catalogue):
+        lacks = ", ".join(missing) or "anything with grasps"
+        raise Refused(
+            f"world.catalogue: suite {suite} needs {lacks} as well; valid: a copy of {BUILT_IN} with your objects added"
+        )
 
 
 def shift(robot: Robot) -> Floats:

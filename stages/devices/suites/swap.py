@@ -18,6 +18,8 @@ _ORDERED = 20
 class Swap(Drawn):
     """A circle of objects on each other's places, a tower upside down, or a full tray in another order."""
 
+    needed = ("tray", *_FLAT)
+
     def choose(self, rng: np.random.Generator) -> None:
         """The kind of exchange, and one or two objects beside it."""
         self._exchange = (self._circle, self._tower, self._tray)[rng.integers(3)]

@@ -11,7 +11,7 @@ import numpy as np
 from runner.contract import Refused
 from stages.devices.suites.draft import SEEN_BESIDE
 from stages.devices.suites.placing import support_height, upright
-from stages.devices.suites.suite import Kind, Rejected, Suite, graspable, shift
+from stages.devices.suites.suite import Kind, Rejected, Suite, graspable, need, shift
 from stages.devices.tabletop import Layout, image_rectangle, is_inside_image, is_seen
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
@@ -113,6 +113,7 @@ class Tray(Suite):
 
     def __init__(self, catalogue: Catalogue, robot: Robot, seed: int, goal: str = "auto", strangers: int = 0) -> None:
         self._catalogue, self._robot, self._goal = catalogue, robot, goal_name(goal, seed)
+        need(TRAY, object_names(self._goal), catalogue)
         self.table = robot.table
         self._strangers = look_alikes(self._goal, catalogue, np.random.default_rng([seed, 2]))[:strangers]
         self.names = (*object_names(self._goal), *self._strangers)

@@ -14,6 +14,8 @@ FIXED = ("tray", "plate", "")
 class Wild(Drawn):
     """6 to 10 objects, up to two of them in no goal."""
 
+    needed = FIXED[:2]
+
     def choose(self, rng: np.random.Generator) -> None:
         """What there is, and what of it is in no goal."""
         fixed = FIXED[rng.choice(3, p=(0.6, 0.2, 0.2))]

@@ -252,3 +252,16 @@ def test_slippery_objects_are_not_as_the_catalogue_has_them_and_fall_from_the_ha
     said = [{world.meddle(hand, PIECE) for _ in range(60)} for hand in hands]
     assert {"cup falls from the hand"} < set.union(*said)
     assert sum(hand.pads == [0.01, 1.0] for hand in hands) == 3
+
+
+def test_a_suite_says_what_a_catalogue_lacks() -> None:
+    few = {label: item for label, item in CATALOGUE.objects.items() if label in ("tray", "plate", "cup")}
+    assert set(kinds.suite("wild", Catalogue(few), ROBOT, 0).names) <= few.keys()
+    with pytest.raises(Refused, match=r"world\.catalogue: suite hidden needs cereal_box, .* as well; valid: a copy of"):
+        kinds.suite("hidden", Catalogue(few), ROBOT, 0)
+    del few["cup"]
+    with pytest.raises(Refused, match="suite wild needs anything with grasps as well"):
+        kinds.suite("wild", Catalogue(few), ROBOT, 0)
+    del few["plate"]
+    with pytest.raises(Refused, match="suite tray needs tea_box, soup_can, cup, sugar_box, water_bottle as well"):
+        kinds.suite("tray", Catalogue(few), ROBOT, 0)
