@@ -40,6 +40,20 @@ def test_a_catalogue_is_beside_the_graph_in_every_stage(
     assert set(found.values()) == {home / "ours" / "objects.yaml"}
 
 
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [
+        *((name, "world") for name in ("graph.yaml", "graphs/ur5e.yaml", "graphs/interactive.yaml")),
+        *((name, "particle_filter") for name in ("graphs/arm.yaml", "graphs/ros2.yaml", "graphs/bag.yaml")),
+        ("graphs/photos.yaml", "detector"),
+    ],
+)
+def test_one_setting_changes_the_catalogue_of_every_stage(name: str, stage: str) -> None:
+    graph = load_graph(ROOT / name, (f"{stage}.catalogue=/ours.yaml", *_needed(ROOT / name)))
+    found = {node.config.catalogue for node in graph.nodes.values() if hasattr(node.config, "catalogue")}
+    assert found == {Path("/ours.yaml")}
+
+
 def test_who_only_reads_a_graph_does_not_wait_for_torch() -> None:
     code = "import sys; from tests.stages import test_graphs as t; [t.load_graph(g, t._needed(g)) for g in t.GRAPHS]"
     command = (sys.executable, "-c", f"{code}; assert 'torch' not in sys.modules")
