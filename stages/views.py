@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runner.contract import Message, Refused
+from runner.contract import Message
 from runner.view.drawing import (
     BarChart,
     Boxes2D,
@@ -101,11 +101,9 @@ class Views:
     """Draws messages; remembers frames and posteriors until their scene estimate comes."""
 
     def __init__(self, configs: Mapping[str, Mapping[str, Any]]) -> None:
-        """Raises :class:`runner.contract.Refused` where no stage names a catalogue."""
         paths = [config["catalogue"] for config in configs.values() if "catalogue" in config]
-        if not paths:
-            raise Refused(f"view: none of the stages {', '.join(configs)} has a setting `catalogue`; objects need one")
-        self._catalogue = Catalogue.load(Path(paths[0]))
+        # A real camera is calibrated without knowing any objects.
+        self._catalogue = Catalogue.load(Path(paths[0])) if paths else Catalogue({})
         self._colors = palette(list(self._catalogue.objects))
         self._refined = configs.get("refiner", {}).get("form") == "default"
         """A better estimate follows the ranker's."""

@@ -30,6 +30,7 @@ GRAPHS = {
     "interactive": (),
     "ur5e": (),
     "calibrate": (),
+    "calibrate_arm": (),
     "bag": ("--set", "camera.bag=d"),
     "ros2": (),
     "reference": (),

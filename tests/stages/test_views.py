@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from runner.contract import Message, Refused
+from runner.contract import Message
 from runner.view.drawing import (
     BarChart,
     Boxes2D,
@@ -320,6 +320,5 @@ def test_progress_tells_the_story(drawn: dict[str, list[Drawing]]) -> None:
     assert progress_line(Restore(name="tea")) == "asked to restore **tea**"
 
 
-def test_views_without_a_catalogue_are_refused() -> None:
-    with pytest.raises(Refused, match=r"none of the stages a, b has a setting `catalogue`"):
-        Views({"a": {}, "b": {"seed": 1}})
+def test_who_calibrates_a_camera_needs_no_catalogue() -> None:
+    assert panels(Views({"arm": {}, "calibrator": {}}).layout())
