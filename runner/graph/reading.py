@@ -277,26 +277,44 @@ def _path_settings(config: type[Any] | None) -> set[str]:
     return {name for name, hint in hints.items() if hint is Path or Path in get_args(hint)}
 
 
-def _fill_in(document: Document, entries: Mapping[str, StageEntry], *keys: tuple[str, str]) -> Any:
-    """Puts what a setting refers to in its place, and the same there first; ``keys`` lead from one to the next."""
-    name, key = keys[-1]
-    value = entries[name].config[key]
-    place = document.place("stages", name, "config", key)
+def _fill_in(document: Document, entries: Mapping[str, StageEntry], *chain: Keys) -> Any:
+    """Puts what a setting refers to in its place, and the same there first; ``chain`` leads from one to the next.
+
+    A group of settings is filled in key by key.
+    """
+    name, *groups, key = chain[-1]
+    values: Any = entries[name].config
+    for group in groups:
+        values = values[group]
+    value = values[key]
+    if isinstance(value, dict):
+        for inner in value:
+            _fill_in(document, entries, *chain, (*chain[-1], inner))
+        return value
+    place = document.place("stages", name, "config", *map(str, (*groups, key)))
     if value == MISSING:
-        raise Refused(f"{place}: has no value yet; give it with --set {name}.{key}=...")
-    valid = {f"{name}.{key}": (name, key) for name, entry in entries.items() for key in entry.config}
+        raise Refused(f"{place}: has no value yet; give it with --set {'.'.join(map(str, chain[-1]))}=...")
 
     def setting(match: re.Match[str]) -> Any:
+        settings = (keys for name, entry in entries.items() for keys in _within(entry.config, name))
+        valid = {".".join(map(str, keys)): keys for keys in settings}
         target = valid.get(match[1])
-        if target is None or target in keys:
+        if target is None or target in chain:
             raise Refused(f"{place}: no setting {match[1]!r} to fill in{suggest(match[1], valid)}")
-        return _fill_in(document, entries, *keys, target)
+        return _fill_in(document, entries, *chain, target)
 
     if isinstance(value, str):
         whole = re.fullmatch(REFERENCE, value)
-        filled = setting(whole) if whole else re.sub(REFERENCE, lambda match: str(setting(match)), value)
-        entries[name].config[key] = value = filled
+        values[key] = value = setting(whole) if whole else re.sub(REFERENCE, lambda match: str(setting(match)), value)
     return value
+
+
+def _within(values: dict[str, Any], *keys: str) -> Iterator[Keys]:
+    """Where each setting stands, those of groups too."""
+    for key, value in values.items():
+        yield (*keys, key)
+        if isinstance(value, dict):
+            yield from _within(value, *keys, key)
 
 
 def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> Node:

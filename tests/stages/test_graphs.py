@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from runner.contract import Refused
 from runner.graph.reading import load_graph
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +54,15 @@ def test_one_setting_changes_the_catalogue_of_every_stage(name: str, stage: str)
     graph = load_graph(ROOT / name, (f"{stage}.catalogue=/ours.yaml", *_needed(ROOT / name)))
     found = {node.config.catalogue for node in graph.nodes.values() if hasattr(node.config, "catalogue")}
     assert found == {Path("/ours.yaml")}
+
+
+def test_a_setting_within_a_group_is_filled_in() -> None:
+    arm, wrong = ROOT / "graphs/arm.yaml", "ros2.frames.base=${camera.topics.bas_frame}"
+    assert load_graph(arm, ("camera.topics.base_frame=map",)).nodes["ros2"].config.frames.base == "map"
+    with pytest.raises(Refused, match=r"^--set ros2.frames.base: no setting .*; did you mean 'camera.topics.base_frame'"):
+        load_graph(arm, (wrong,))
+    with pytest.raises(Refused, match=r"^--set camera.topics.info: has no value yet; give it with --set camera.topics"):
+        load_graph(arm, ("camera.topics.info=???",))
 
 
 def test_who_only_reads_a_graph_does_not_wait_for_torch() -> None:
