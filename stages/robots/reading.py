@@ -247,6 +247,9 @@ def _check(root: Section, robot: Robot) -> None:
     _known(gripper, (robot.gripper.link,), links, "link")
     _known(gripper, (robot.hand,), links, "near")
     _known(gripper, robot.model.pads, geoms, "pads")
+    way = [name for name in _joints_to(spec.body(robot.gripper.link)) if name not in robot.posture]
+    if way:
+        root.refuse(f"{', '.join(way)} on the way to the hand: name each here or under still", "joints")
     if robot.camera.link:
         _known(root.section("camera"), (robot.camera.link,), links, "link")
     _known(root, (name for pair in robot.model.touching for name in pair), links, "touching")
@@ -261,6 +264,11 @@ def _check(root: Section, robot: Robot) -> None:
         robot.specification(seen=False).compile()
     except ValueError as error:
         root.refuse(f"MuJoCo cannot build it: {error}", "model")
+
+
+def _joints_to(body: Any) -> list[str]:
+    """The joints between the world and a body of MuJoCo's specification."""
+    return [*_joints_to(body.parent), *(joint.name for joint in body.joints)] if body.parent else []
 
 
 def _known(section: Section, names: Iterable[str], valid: list[str], key: str = "") -> None:

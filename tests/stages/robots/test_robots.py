@@ -89,6 +89,11 @@ def test_the_torso_carries_the_camera() -> None:
             "elbow_joint: {",
             r":\d+: joints\.elbow_joint: 'elbow_joint' is not in the model, which has",
         ),
+        (
+            "  elbow_flex_joint: {",
+            "  # elbow_flex_joint: {",
+            r":\d+: joints: elbow_flex_joint on the way to the hand: name each here or under still",
+        ),
         ("link: gripper_link", "link: grip", r":\d+: gripper\.link: 'grip' is not in the model"),
         ("gymnasium_robotics/", "gymnasium_robot/", r"model\[0\]\.folder: .* 'gymnasium_robot' is not installed"),
         ("velocity: 0.10,", "", r"joints\.torso_lift_joint: the key 'velocity' is missing"),
