@@ -41,10 +41,20 @@ def _names_a_graph(given: Sequence[str], commands: Collection[str]) -> bool:
     return given[0] in packaged_graphs()
 
 
+class _Runner(argparse.ArgumentParser):
+    def format_help(self) -> str:
+        """Looks for the graphs that packages bring only when somebody asks."""
+        from runner.graph.packaged import packaged_graphs
+
+        names = ", ".join(sorted(packaged_graphs()))
+        self.epilog = f"`runner NAME` is `runner up NAME` of a graph that an installed package brings: {names}"
+        return super().format_help()
+
+
 def parser() -> tuple[argparse.ArgumentParser, Collection[str]]:
     """All commands with their options, and their names."""
-    parser = argparse.ArgumentParser(prog="runner", description="Runs, checks, records and replays graphs of stages.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    parser = _Runner(prog="runner", description="Runs, checks, records and replays graphs of stages.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=argparse.ArgumentParser)
     for group in (new, graphs, live, recordings, replay, keys, machine):
         group.add_commands(commands)
     return parser, commands.choices

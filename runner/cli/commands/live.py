@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.cli import completion
-from runner.cli.commands import Commands, add, add_recordings, count
+from runner.cli.commands import Commands, add, add_recordings, count, graph_file
 from runner.cli.completion import completed
 from runner.contract import Refused
 
@@ -52,7 +52,7 @@ def add_commands(commands: Commands) -> None:
     goals.add_argument("name", metavar="NAME", nargs="?", help="only this one")
     goals.add_argument("--delete", action="store_true", help="delete it")
     text = "what this graph keeps on disk, whether it runs or not"
-    goals.add_argument("--graph", metavar="GRAPH", type=Path, help=text)
+    goals.add_argument("--graph", metavar="GRAPH", type=graph_file, help=text)
     _add_run(goals)
 
     page = add(commands, "page", _page, "serve a page on the running graph, for people who do not program")

@@ -81,6 +81,9 @@ def test_a_graph_is_found_by_its_name(package: Path, tmp_path: Path, capsys: pyt
     assert main(["check", "told"]) == 0
     assert main(["check", "tolt"]) == 2
     assert "tolt: no such file, and no graph of an installed package; did you mean 'told'" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert "told" in capsys.readouterr().out
     Path("told").write_text("name: [")
     assert main(["check", "told"]) == 2
     assert "not YAML" in capsys.readouterr().err
