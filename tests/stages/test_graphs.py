@@ -59,7 +59,9 @@ def test_one_setting_changes_the_catalogue_of_every_stage(name: str, stage: str)
 def test_a_setting_within_a_group_is_filled_in() -> None:
     arm, wrong = ROOT / "graphs/arm.yaml", "ros2.frames.base=${camera.topics.bas_frame}"
     assert load_graph(arm, ("camera.topics.base_frame=map",)).nodes["ros2"].config.frames.base == "map"
-    with pytest.raises(Refused, match=r"^--set ros2.frames.base: no setting .*; did you mean 'camera.topics.base_frame'"):
+    with pytest.raises(
+        Refused, match=r"^--set ros2.frames.base: no setting .*; did you mean 'camera.topics.base_frame'"
+    ):
         load_graph(arm, (wrong,))
     with pytest.raises(Refused, match=r"^--set camera.topics.info: has no value yet; give it with --set camera.topics"):
         load_graph(arm, ("camera.topics.info=???",))
