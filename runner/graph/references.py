@@ -5,10 +5,12 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import metadata, packages_distributions
+from pathlib import Path
 from typing import Any, TypeVar
 
 from runner.contract import Migration, Migrations, Refused, Tolerance, Tolerances
 from runner.graph.document import suggest
+from runner.graph.packaged import find
 
 T = TypeVar("T")
 
@@ -70,7 +72,7 @@ def _module(name: str, place: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not (name == error.name or name.startswith(f"{error.name}.")):
             raise Refused(f"{place}: {name} cannot be imported: {error}{_extra(name)}") from None
-        raise Refused(f"{place}: no module {name!r}{suggest(name, _modules_beside(name))}") from None
+        raise Refused(f"{place}: no module {name!r}{_elsewhere(name)}") from None
     except ImportError as error:
         raise Refused(f"{place}: {name} cannot be imported: {error}") from None
 
@@ -82,6 +84,14 @@ def _extra(module_name: str) -> str:
     owners = packages_distributions().get(package, ())
     found = [owner for owner in owners if package in (metadata(owner).get_all("Provides-Extra") or ())]
     return f"; type: pip install '{found[0]}[{package}]'" if found else ""
+
+
+def _elsewhere(module_name: str) -> str:
+    """What the missing module may be instead or, where even its package is missing, what to do."""
+    top = module_name.partition(".")[0]
+    if find(top):
+        return suggest(module_name, _modules_beside(module_name))
+    return f": {top} is neither in {Path.cwd()} nor installed; run this in the folder that has it, or install it"
 
 
 def _modules_beside(module_name: str) -> list[str]:

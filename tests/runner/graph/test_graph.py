@@ -48,6 +48,11 @@ def test_a_good_graph_loads(tmp_path: Path):
         ("seed: 7", "seed: many", ":2: seed: Expected `int`, got 'many'"),
         ("toys:Sink", "toys:Snk", ":19: stages.sink.stage: no class 'Snk' in .*; did you mean 'Sink'"),
         ("toys:Sink", "toyz:Sink", ":19: stages.sink.stage: no module 'tests.runner.common.toyz'; did"),
+        (
+            "tests.runner.common.toys:Sink",
+            "hello:Sink",
+            r":19: stages.sink.stage: no module 'hello': hello is neither in /\S+ nor installed; run",
+        ),
         ("toys:Sink", "toys:Number", ":19: stages.sink.stage: .* is not"),
         ("total: gatherer.total", "total: gatherr.total", ":22: stages.sink.inputs.total: no stage 'gatherr'; did"),
         (
