@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from stages.geometry.arrays import Floats
 from stages.planning.motion.collision import CollisionWorld
 from stages.planning.motion.pick_place import MARGINS, Errand, PickPlacePlanner
 from stages.planning.places.placements import Scene
@@ -30,9 +31,7 @@ class Handling:
 
     def of(self, step: Step, scene: Scene, places: Sequence[Standing]) -> Handled:
         """A step of a plan, with the places that its object may go to, best first."""
-        objects = {
-            name: (item.stance.item, scene.T_base_table @ item.T_table_object) for name, item in scene.standing.items()
-        }
+        objects = {name: (item.stance.item, scene.T_base_table @ _pose(item)) for name, item in scene.standing.items()}
         table = self._table.seen(scene.T_base_table, scene.surface)
         world = CollisionWorld(self._robot, table, objects, carried=step.item, clearance=MARGINS[-1].clearance)
         targets = np.stack([scene.T_base_table @ place.T_table_object for place in places])
@@ -66,6 +65,11 @@ class Handled:
     def why_not(self) -> tuple[str, tuple[str, ...]]:
         """Why no place is reached: in words, and the objects in the way."""
         return self._planner.obstacle[1], self._planner.in_the_way(self._robot.home)
+
+
+def _pose(item: Standing) -> Floats:
+    """T_table_object, as the hand will find it."""
+    return item.T_table_object if item.T_table_leaning is None else item.T_table_leaning
 
 
 def _difference(a: Standing, b: Standing) -> float:

@@ -218,6 +218,8 @@ class Standing:
     name: str
     stance: Stance
     T_table_stance: Floats
+    T_table_leaning: Floats | None = None
+    """The object's estimated pose, where it leans by more than an estimate is off."""
 
     @staticmethod
     def at(name: str, stances: Stances, T_table_object: Floats) -> Standing:

@@ -333,6 +333,34 @@ def test_a_neighbour_that_keeps_the_hand_away_is_moved_first():
     assert reached(crowded_goal(), executed(stuck, found))
 
 
+LEANING = Layout(
+    {
+        "tray": np.array(
+            [[0.8904, -0.4551, 0, 0.1552], [0.4551, 0.8904, 0, 0.0107], [0, 0, 1, 0.015], [0, 0, 0, 1]]
+        ),
+        "sponge": np.array(
+            [[-0.7815, 0.6239, 0, 0.1489], [-0.6239, -0.7815, 0, 0.0671], [0, 0, 1, 0.028], [0, 0, 0, 1]]
+        ),
+        "bowl": np.array(
+            [
+                [0.6545, -0.7460, -0.1232, 0.2896],
+                [0.7444, 0.6643, -0.0676, 0.0565],
+                [0.1323, -0.0475, 0.9901, 0.0404],
+                [0, 0, 0, 1],
+            ]
+        ),
+    }
+)  # fmt: skip
+"""A bowl in a tray stands on its rim, by 8 degrees, with its edge above a sponge."""
+
+
+def test_what_leans_over_an_object_is_moved_before_that_is_lifted():
+    goal = Layout({"tray": LEANING.poses["tray"]}).put("sponge", -0.15, -0.25).put("bowl", 0.05, 0.0, on="tray")
+    found = plan(goal, LEANING)
+    assert found.status == "solved", found.reason
+    assert [transfer.object for transfer in found.transfers][:2] == ["bowl", "sponge"]
+
+
 def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
     assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]

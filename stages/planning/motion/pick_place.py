@@ -29,6 +29,8 @@ SLID = 0.06
 RELEASE = 0.010
 """Metres that each finger opens to let go, where there is room."""
 
+_LIFTED = (0.01, LIFT / 2)
+"""Metres above where it stands at which is looked for what an object would touch as it is lifted."""
 _RESTARTS = 12
 """Random postures from which inverse kinematics starts: near the robot, few of them lead to a free one."""
 _KEPT = 3
@@ -161,7 +163,7 @@ class PickPlacePlanner:
         return sum(not self._world.objects[name].grasps for name in names), len(names)
 
     def _touched(self, hand: HandPose, start: Floats) -> tuple[str, ...]:
-        """Objects too near the hand or what it holds; none where it is not reached or something else is too near."""
+        """Objects too near the hand or what it holds, also as it is lifted; none where it is not reached or something else is too near."""
         world = self._world
         world.set_width(opening(world, hand.grasp, self._room))
         placing = [self.holding(hand), world.resting(self._errand.destination)]
@@ -170,6 +172,9 @@ class PickPlacePlanner:
             for context in placing if self._is_picked else [world.touching(world.carried)]:
                 stack.enter_context(context)
             found = [self._near(T, start) for T in (hand.T_base_hand, before)]
+        if not self._is_picked:
+            with self.holding(hand), world.resting(self._errand.source):
+                found += [self._near(raised(hand.T_base_hand, height), start) for height in _LIFTED]
         return () if None in found else tuple(sorted(set[str]().union(*filter(None, found))))
 
     def _near(self, T_base_hand: Floats, start: Floats) -> set[str] | None:

@@ -16,7 +16,7 @@ from stages.messages.scene import SceneGraph
 from stages.planning.symbolic.problem import TABLE, carriers
 from stages.planning.symbolic.search import Step
 from stages.scene.facing import sides, turned_to
-from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, yawed
+from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, turned, yawed
 from stages.scene.virtual import in_region, region_poses
 
 QUARTERS = 4
@@ -26,6 +26,8 @@ TURNED = 0.03
 """Cost of a quarter turn that the demonstration did not show, in metres of shift."""
 _HANGS = 0.012
 """Metres above what carries it from which on something must be under an object."""
+_LEANS = np.deg2rad(3)
+"""Tilt from which on an object leans: an estimate is off by less, radians."""
 _ANYWHERE = 1.0
 """Metres from where it was shown within which an object may stand that only has to be on the table."""
 
@@ -53,12 +55,15 @@ class Scene:
         """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy; what hangs in
         the air stays there, for it stands on something that was not seen."""
         standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
+        poses = {item.name: item.T_base_object for item in graph.objects}
         scene = Scene({}, carriers(graph), graph.T_base_table, graph.support, _eye(graph))
         while standing:
             name = next(name for name in standing if scene.supports[name] not in standing)
             item, support = standing.pop(name), scene.supports[name]
             rested = scene.rested(item, support)
-            scene = scene.after(name, item if _hangs(item, rested) else rested, support)
+            leaning = _leaning(item, inverse(graph.T_base_table) @ poses[name])
+            rested = replace(item if _hangs(item, rested) else rested, T_table_leaning=leaning)
+            scene = scene.after(name, rested, support)
         return scene
 
     def hangs(self, name: str) -> bool:
@@ -86,6 +91,11 @@ class Scene:
             chain.add(support)
             support = self.supports[support]
         return [item for item in self.standing.values() if item.name not in chain]
+
+
+def _leaning(item: Standing, T_table_object: Floats) -> Floats | None:
+    """Where an object was estimated, if it leans."""
+    return T_table_object if turned(item.stance.item, T_table_object, item.T_table_object) > _LEANS else None
 
 
 def _hangs(item: Standing, rested: Standing) -> bool:
@@ -134,8 +144,8 @@ class Placements:
         costs: list[Floats] = []
         for k, T in enumerate(nominal):
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
-            for turned, cost in self._orientations(T, item, scene):
-                bases.append(Standing.at(step.item, stances, turned))
+            for facing, cost in self._orientations(T, item, scene):
+                bases.append(Standing.at(step.item, stances, facing))
                 costs.append(away + cost + lengths[: None if k == 0 and cost < TURNED else 13])
         which = [(base, shift) for base, some in enumerate(costs) for shift in range(len(some))]
         every = np.concatenate(costs)
