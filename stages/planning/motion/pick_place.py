@@ -163,7 +163,8 @@ class PickPlacePlanner:
         return sum(not self._world.objects[name].grasps for name in names), len(names)
 
     def _touched(self, hand: HandPose, start: Floats) -> tuple[str, ...]:
-        """Objects too near the hand or what it holds, also as it is lifted; none where it is not reached or something else is too near."""
+        """Objects too near the hand or what it holds, also as that is lifted; none where a posture is not reached or
+        something else is too near."""
         world = self._world
         world.set_width(opening(world, hand.grasp, self._room))
         placing = [self.holding(hand), world.resting(self._errand.destination)]
