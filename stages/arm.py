@@ -79,7 +79,7 @@ class Ros2Arm(Stage):
 
     def _show(self, command: RobotCommand) -> Iterator[Said]:
         """The motion as a ghost. The encoders stay as they are; once the hand would close, there is no more to show."""
-        if len(command.times) and self._arm.known():
+        if len(command.times) and not self._arm.trouble():
             self._arm.show(command)
             yield Ros2Sent(messages=self._take(self._arm.sent))
         closes = command.gripper_width is not None and command.gripper_width < self._robot.gripper.open_width / 2
@@ -101,11 +101,12 @@ class Ros2Arm(Stage):
         return taken
 
     def _state(self, stopped: Stopped, reason: str) -> RobotState:
-        """Where the robot is; without joints where that is not known."""
+        """Where the robot is; without joints, and as a fault, where that is not known."""
         arm, robot = self._arm, self._robot
-        if not arm.known():
+        if why := arm.trouble():
+            reason = reason if why in reason else "; ".join(filter(None, (reason, why)))
             return RobotState(
-                joint_names=(), positions=np.zeros(0), gripper_width=0.0, time=0.0, stopped=stopped, reason=reason
+                joint_names=(), positions=np.zeros(0), gripper_width=0.0, time=0.0, stopped="fault", reason=reason
             )
         opening = arm.opening()
         fingers = robot.gripper.posture(opening)

@@ -45,6 +45,8 @@ class CalibrationRoutine:
         """From wherever the arm stands."""
         self._sights = []
         state: RobotState = yield self._read()
+        if state.stopped:
+            return self.failure(_stands(state))
         at = arm(self._rig.robot, state)
         if touching := self._world.contacts(at):
             return self.failure(f"where the arm stands, {_pairs(touching)} would touch: move it, or the board")
@@ -57,11 +59,13 @@ class CalibrationRoutine:
                 self._log(f"pose {number} of {len(postures)}: no free way there")
                 continue
             state = yield self._move(path, f"calibration pose {number} of {len(postures)}")
-            at = arm(self._rig.robot, state)
             if state.stopped:
-                return self.failure(f"{state.stopped}: {state.reason}; the arm stands where it is")
+                return self.failure(_stands(state))
+            at = arm(self._rig.robot, state)
             frame: Frame = yield LookRequest(purpose=f"calibration pose {number}")
             state = yield self._read()
+            if state.stopped:
+                return self.failure(_stands(state))
             self._see(frame, arm(self._rig.robot, state), at, f"pose {number} of {len(postures)}")
         back = free_motion(self._world, at, self._rig.robot.home, rng)
         if back is not None:
@@ -172,3 +176,7 @@ def _calibration(rig: Rig, **fields: Any) -> CameraCalibration:
 
 def _pairs(touching: set[tuple[str, str]]) -> str:
     return ", ".join(f"{one} and {other}" for one, other in sorted(touching))
+
+
+def _stands(state: RobotState) -> str:
+    return f"{state.stopped}: {state.reason}; the arm stands where it is"

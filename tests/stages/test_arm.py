@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -188,7 +189,7 @@ def broken(robot: FakeRobot, what: str) -> None:
     elif what == "old":
         robot.behind = 35.0
     elif what == "quiet":
-        threading.Timer(0.3, lambda: setattr(robot, "quiet", True)).start()
+        threading.Timer(0.8, lambda: setattr(robot, "quiet", True)).start()
     elif what == "moved":
         robot.q = HOME + 0.3
 
@@ -248,6 +249,55 @@ def test_an_arm_that_tells_no_efforts_feels_no_force_and_says_so_once() -> None:
     assert [one.force for one in said if isinstance(one, RobotState)] == [0.0, 0.0]
 
 
+def test_an_arm_whose_joints_come_in_several_messages_is_watched_all_the_same() -> None:
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint) as stage:
+        robot.split, robot.held_up = True, 0.0
+        held = state_of(stage, turn(0.2, 0.5))
+    assert held.stopped == "fault" and "the controller stands on the way for 1 s and says nothing" in held.reason
+
+
+def test_an_arm_that_tells_no_efforts_any_more_is_stopped() -> None:
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint, Controllers()) as stage:
+        robot.torques = [1.0] * len(NAMES)
+        time.sleep(0.1)
+        threading.Timer(0.3, lambda: setattr(robot, "torques", [math.nan] * len(NAMES))).start()
+        state = state_of(stage, turn(0.05, 2.0))
+    assert (state.stopped, state.reason) == ("fault", "/joint_states: gives no efforts any more")
+    assert robot.arm.canceling
+
+
+def test_what_was_not_given_up_is_given_up_before_anything_else_moves() -> None:
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint) as stage:
+        state_of(stage, still())
+        robot.arm.refuses = True
+        threading.Timer(0.3, lambda: stage.on_brake(Brake())).start()
+        refused = state_of(stage, turn(0.2, 0.8))
+        robot.q = HOME.copy()
+        again = state_of(stage, turn(0.2, 0.4))
+        robot.arm.refuses = False
+        mended = state_of(stage, turn(0.2, 0.4))
+    assert (refused.stopped, refused.reason) == ("stop", "as asked; the controller refuses to give it up")
+    assert (again.stopped, len(robot.arm.goals)) == ("fault", 2)
+    assert again.reason == "a goal of before may be under way; the controller refuses to give it up"
+    assert mended.stopped == "", mended.reason
+
+
+def test_two_publishers_of_all_joints_are_named_though_one_tells_no_efforts() -> None:
+    """As a window with sliders does that somebody opens while the arm moves."""
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint, Controllers()) as stage:
+        robot.torques = [1.0] * len(NAMES)
+        time.sleep(0.1)
+        with node(endpoint, "sliders") as other:
+            publisher, stopping = other.publisher(WHERE.joint_states, JOINTS), threading.Event()
+            thread = threading.Thread(target=babble, args=(other, publisher, stopping, NAMES, HOME.tolist()))
+            threading.Timer(0.3, thread.start).start()
+            state = state_of(stage, turn(0.05, 2.0))
+            stopping.set()
+            thread.join()
+    assert state.stopped == "fault" and robot.arm.canceling
+    assert "is published by" in state.reason or "gives no efforts any more" in state.reason
+
+
 def test_two_publishers_of_one_joint_are_named_and_nothing_moves() -> None:
     with router() as endpoint, lab(endpoint) as robot, arm(endpoint) as stage, node(endpoint, "ghost") as other:
         publisher = other.publisher(WHERE.joint_states, JOINTS)
@@ -262,11 +312,17 @@ def test_two_publishers_of_one_joint_are_named_and_nothing_moves() -> None:
     assert state.stopped == "fault" and not robot.arm.goals
 
 
-def babble(node: Node, publisher: Any, stopping: threading.Event) -> None:
+def babble(
+    node: Node,
+    publisher: Any,
+    stopping: threading.Event,
+    names: Sequence[str] = ("elbow_joint",),
+    positions: Sequence[float] = (1.8,),
+) -> None:
     while not stopping.wait(0.02):
         sec, nanosec = divmod(time.time_ns(), 10**9)
         header = {"stamp": {"sec": sec, "nanosec": nanosec}}
-        publisher.put(node.types.new(JOINTS, header=header, name=["elbow_joint"], position=[1.8]))
+        publisher.put(node.types.new(JOINTS, header=header, name=list(names), position=list(positions)))
 
 
 def test_without_a_robot_it_is_said_what_there_is() -> None:

@@ -115,6 +115,7 @@ def run(seed: int, folder: Path, settings: Sequence[str]) -> tuple[Episode, dict
         *links,
         "arm.armed=true",
         "arm.calibrated=true",
+        "arm.controllers.efforts=true",
         f"goals.folder={goals.name}",
         *settings,
         folder=folder,

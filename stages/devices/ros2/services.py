@@ -25,6 +25,8 @@ _KEPT_GOALS = 16
 STATUSES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 """Of a goal, by number: action_msgs/msg/GoalStatus."""
 CANCEL = "action_msgs/srv/CancelGoal"
+_REJECTED = 1
+"""Of its return codes; those above say that there is no such goal any more."""
 
 
 class Unanswered(Exception):
@@ -210,7 +212,7 @@ class ActionClient:
         Raises:
             Unanswered: no answer came.
         """
-        return self._cancel.call(seconds=seconds, goal_info={"goal_id": {"uuid": list(id)}}).return_code == 0
+        return self._cancel.call(seconds=seconds, goal_info={"goal_id": {"uuid": list(id)}}).return_code != _REJECTED
 
     def _on_feedback(self, received: Received) -> None:
         with self._changing:

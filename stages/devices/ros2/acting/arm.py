@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from stages.devices.efforts import Efforts, Felt
-from stages.devices.ros2.acting.joints import JointStates
+from stages.devices.ros2.acting.joints import JointStates, Known
 from stages.devices.ros2.acting.path import Path, Progress, duration
 from stages.devices.ros2.node import Node
 from stages.devices.ros2.services import CANCEL, STATUSES, ActionClient, Goal, Unanswered
 from stages.devices.ros2.settings import Care, Controllers, Link
-from stages.devices.ros2.transforms import stamp_ns
 from stages.devices.ros2.wire import LATCHED
 from stages.geometry.arrays import Floats
 from stages.messages import RobotCommand, Ros2Message
@@ -40,6 +39,10 @@ _CODES = {
 """Of a FollowJointTrajectory result."""
 _HELD_UP = (-4, -5)
 """Codes of an arm that was held up: something is in its way."""
+
+
+_Check = Callable[[Sequence[Known]], None]
+"""Takes what is known of the joints; raises where a command is to be broken off."""
 
 
 class _Broken(Exception):
@@ -74,6 +77,8 @@ class RemoteArm:
         self._shown: list[Any] = []
         """Motions that were shown as ghosts since the encoders were read."""
         self._asked = False
+        self._unstopped: tuple[ActionClient, bytes] | None = None
+        """A goal that may be under way though it was to be given up."""
         self._stands = False
         """Nothing that is not known of can be moving: the newest command has ended well."""
         self.error = 0.0
@@ -99,6 +104,7 @@ class RemoteArm:
         try:
             yield from self._know()
             if unknown:
+                self._stop_again()
                 yield from self._rest()
             if len(command.times):
                 yield from self._follow(command, id())
@@ -125,9 +131,9 @@ class RemoteArm:
         self._ghosts.put(ghost)
         self.sent.append(self._kept(self._ghosts.endpoint.topic, ghost))
 
-    def known(self) -> bool:
-        """Whether every joint has been heard of and nothing speaks against it."""
-        return not self._joints.trouble()
+    def trouble(self) -> str:
+        """Why the joints are not known now; empty where they are."""
+        return self._joints.trouble()
 
     def posture(self) -> Floats:
         """J, of the robot's joints; they must be known."""
@@ -171,8 +177,8 @@ class RemoteArm:
         )
         watch = _Watch(path, self._felt(q), care.stuck)
 
-        def check(message: Any) -> None:
-            self._look(watch, message, command.guard)
+        def check(joints: Sequence[Known]) -> None:
+            self._look(watch, joints, command.guard)
 
         status, result = yield from self._goal(self._arm, FOLLOW, id, goal, check)
         if status != "succeeded" or result.error_code != 0:
@@ -189,13 +195,11 @@ class RemoteArm:
             self._efforts = None
         return None if self._efforts is None else Felt(self._efforts, q, measured)
 
-    def _look(self, watch: _Watch, message: Any, guard: Guard | None) -> None:
-        """Takes a joint state; raises where it breaks what must hold."""
-        where = {name: index for index, name in enumerate(message.name)}
-        if not set(self._names) <= set(where):
-            return
-        order = [where[name] for name in self._names]
-        error, force = watch.take(message, order)
+    def _look(self, watch: _Watch, joints: Sequence[Known], guard: Guard | None) -> None:
+        """Takes what is known of the joints; raises where it breaks what must hold."""
+        error, force = watch.take(joints[: len(self._names)])
+        if not np.isfinite(force):
+            raise _Broken("fault", f"{self._controllers.joint_states}: gives no efforts any more")
         self.error, self.force = max(self.error, error), max(self.force, force)
         if guard is not None and (broken := guard.broken(opening=self.opening(), force=force, error=error)):
             raise _Broken(*broken)
@@ -210,7 +214,7 @@ class RemoteArm:
             command = {"name": [self._finger], "position": [told], "effort": [controllers.gripper_effort]}
         late = time.monotonic() + self._care.stuck
 
-        def check(_: Any) -> None:
+        def check(_: Sequence[Known]) -> None:
             if time.monotonic() > late:
                 raise _Broken("fault", f"{controllers.gripper}: has not ended within {self._care.stuck:g} s")
 
@@ -221,9 +225,10 @@ class RemoteArm:
         yield from self._rest()
 
     def _goal(
-        self, client: ActionClient, type: str, id: bytes, fields: dict[str, Any], check: Callable[[Any], None]
+        self, client: ActionClient, type: str, id: bytes, fields: dict[str, Any], check: _Check
     ) -> Generator[None, None, tuple[str, Any]]:
-        """Has a goal carried out, while ``check`` takes every joint state; returns its status and result."""
+        """Has a goal carried out, while ``check`` takes every joint state; returns its status and result. However that
+        ends early, the goal is cancelled."""
         if self._asked:
             raise _Broken("stop", "as asked")
         name = client.name
@@ -243,7 +248,7 @@ class RemoteArm:
                 self._attend(check)
         except _Broken as broken:
             raise _Broken(broken.stopped, f"{broken}{self._cancel(client, id)}") from None
-        except GeneratorExit:
+        except BaseException:
             self._cancel(client, id)
             raise
         status, result = ended
@@ -251,10 +256,10 @@ class RemoteArm:
         self.heard.append(self._kept(f"{name}/_action/get_result", response))
         return status, result
 
-    def _attend(self, check: Callable[[Any], None]) -> None:
+    def _attend(self, check: _Check) -> None:
         """Looks at what came since the last time; raises where the command is to be broken off."""
-        for message in self._listen():
-            check(message)
+        for joints in self._listen():
+            check(joints)
         if self._asked:
             raise _Broken("stop", "as asked")
         if why := self._joints.trouble():
@@ -264,38 +269,49 @@ class RemoteArm:
         """Has a goal given up and waits until nothing moves; returns what went wrong with that, in words to append."""
         request = self._types.new(f"{CANCEL}_Request", goal_info={"goal_id": {"uuid": list(id)}})
         self.sent.append(self._kept(f"{client.name}/_action/cancel_goal", request))
+        self._unstopped = client, id
         try:
-            client.cancel(id, seconds=self._care.answer)
+            agreed = client.cancel(id, seconds=self._care.answer)
             for _ in self._rest():
                 pass
         except Unanswered as error:
             return f"; it could not be told to stop: {error}"
         except _Broken as broken:
             return f"; {broken}"
+        if not agreed:
+            return "; the controller refuses to give it up"
+        self._unstopped = None
         return ""
+
+    def _stop_again(self) -> None:
+        """Has what could not be stopped before given up, before anything else moves."""
+        if self._unstopped is not None and (why := self._cancel(*self._unstopped)):
+            raise _Broken("fault", f"a goal of before may be under way{why}")
 
     def _rest(self) -> Iterator[None]:
         """Waits until the arm stands."""
         seen: deque[tuple[float, Floats]] = deque()
         until = time.monotonic() + self._care.stuck
         while not seen or seen[-1][0] - seen[0][0] < _SETTLE:
-            self._listen()
+            heard = self._listen()
             if why := self._joints.trouble():
                 raise _Broken("fault", why)
             now, q = time.monotonic(), self.posture()
             while seen and np.abs(seen[0][1] - q).max() > _STILL:
                 seen.popleft()
-            seen.append((now, q))
+            if heard:
+                seen.append((now, q))
             if now > until:
                 raise _Broken("fault", f"the arm does not come to rest within {self._care.stuck:g} s")
             yield
 
-    def _listen(self) -> list[Any]:
-        """Joint states that have come; waits for one for a moment."""
+    def _listen(self) -> list[Sequence[Known]]:
+        """What is known of the joints, the robot's and the finger, at every joint state that has come; waits for one
+        for a moment."""
         news = self._joints.take(_PIECE)
         topic = self._controllers.joint_states
-        self.heard.extend(self._kept(topic, message, time_ns) for time_ns, message in news)
-        return [message for _, message in news]
+        self.heard.extend(self._kept(topic, one.message, one.time_ns) for one in news)
+        return [one.joints for one in news if one.joints]
 
     def _kept(self, topic: str, message: Any, time_ns: int = 0) -> Ros2Message:
         data = np.frombuffer(self._types.encode(message), np.uint8)
@@ -309,13 +325,13 @@ class _Watch:
         self._progress, self._felt, self._stuck = Progress(path), felt, stuck
         self._began = self._moved = time.monotonic()
 
-    def take(self, message: Any, order: list[int]) -> tuple[float, float]:
+    def take(self, joints: Sequence[Known]) -> tuple[float, float]:
         """How far the arm is from its path, radians (metres), and the force that it feels, newtons.
 
-        ``order`` are the indices of the robot's joints. Raises where it makes no progress for too long.
+        ``joints`` are the robot's. Raises where it makes no progress for too long.
         """
         now, progress = time.monotonic(), self._progress
-        before, q = progress.index, message.position[order]
+        before, q = progress.index, np.array([one.position for one in joints])
         error = progress.advance(q, now - self._began)
         if progress.index != before:
             self._moved = now
@@ -324,7 +340,8 @@ class _Watch:
             raise _Broken("fault", f"the controller stands {where} for {self._stuck:g} s and says nothing")
         if self._felt is None:
             return error, 0.0
-        k, seconds, measured = progress.index, stamp_ns(message.header) / 1e9, message.effort[order]
+        k, seconds = progress.index, max(one.stamp_ns for one in joints) / 1e9
+        measured = np.array([one.effort for one in joints])
         return error, self._felt.newtons(q, progress.velocities[k], progress.accelerations[k], measured, seconds)
 
 

@@ -26,7 +26,7 @@ _SHOWN = 8
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class Known:
     """The newest of one joint."""
 
     position: float
@@ -40,21 +40,31 @@ class _Known:
     """Seconds between stamp and arrival."""
 
 
+@dataclass(frozen=True, slots=True)
+class News:
+    """A message, and what was known once it had come."""
+
+    time_ns: int
+    message: Any
+    joints: tuple[Known, ...]
+    """Of the needed joints, in their order; empty where some are not known yet, or the message tells of none."""
+
+
 class JointStates:
     """Listens to joint states from the moment it is made; several publishers may each tell of some joints."""
 
     def __init__(self, node: Node, topic: str, needed: Sequence[str], care: Care) -> None:
         """``needed`` are the joints without which nothing may move."""
         self._node, self._needed, self._care = node, tuple(needed), care
-        self._known: dict[str, _Known] = {}
+        self._known: dict[str, Known] = {}
         self._rivals: dict[str, tuple[float, tuple[bytes, bytes]]] = {}
         """Joints of two publishers: when that was seen, and which they are."""
-        self._news: deque[tuple[int, Any]] = deque(maxlen=_KEPT)
+        self._news: deque[News] = deque(maxlen=_KEPT)
         self._changed = threading.Condition()
         self._endpoint = node.subscribe(topic, JOINTS, self._take)
 
-    def take(self, seconds: float) -> list[tuple[int, Any]]:
-        """Messages since the last time, with when they came; waits for one for so long."""
+    def take(self, seconds: float) -> list[News]:
+        """What came since the last time; waits for a message for so long."""
         with self._changed:
             self._changed.wait_for(lambda: self._news, seconds)
             news = list(self._news)
@@ -110,11 +120,15 @@ class JointStates:
         efforts = message.effort if len(message.effort) == len(message.name) else [math.nan] * len(message.name)
         with self._changed:
             for name, position, effort in zip(message.name, message.position, efforts, strict=False):
+                if not math.isfinite(position):
+                    continue  # as if it said nothing of the joint, which is named once that is long ago
                 before = self._known.get(name)
                 if before and before.publisher != received.publisher and now - before.came < _RIVAL_SECONDS:
                     self._rivals[name] = now, (before.publisher, received.publisher)
-                self._known[name] = _Known(
+                self._known[name] = Known(
                     float(position), float(effort), received.publisher, now, stamp, abs(now_ns - stamp) / 1e9
                 )
-            self._news.append((now_ns, message))
+            told = not set(self._needed).isdisjoint(message.name) and self._known.keys() >= set(self._needed)
+            joints = tuple(self._known[name] for name in self._needed) if told else ()
+            self._news.append(News(now_ns, message, joints))
             self._changed.notify_all()

@@ -30,7 +30,7 @@ class Action:
     def __init__(self, node: Node, name: str, type: str) -> None:
         self._node, self._type = node, type
         self.goals: list[Any] = []
-        self.accepts, self.silent, self.canceling = True, False, False
+        self.accepts, self.silent, self.canceling, self.refuses = True, False, False, False
         self._waiting: Request | None = None
         self._result: tuple[int, dict[str, Any]] | None = None
         self._changing = threading.Lock()
@@ -60,9 +60,12 @@ class Action:
             self._answer()
 
     def _on_cancel(self, request: Request) -> None:
+        new, response = self._node.types.new, "action_msgs/srv/CancelGoal_Response"
+        if self.refuses:
+            request.answer(new(response, return_code=1))
+            return
         self.canceling = True
-        new = self._node.types.new
-        request.answer(new("action_msgs/srv/CancelGoal_Response", goals_canceling=[request.message.goal_info]))
+        request.answer(new(response, goals_canceling=[request.message.goal_info]))
 
     def _answer(self) -> None:
         if self._waiting is not None and self._result is not None and not self.silent:
@@ -87,6 +90,10 @@ class FakeRobot:
         self.behind = 0.0
         """Seconds by which their stamps are old."""
         self.without_finger = False
+        self.split = False
+        """Its joints come in two messages."""
+        self.torques: list[float] = []
+        """Efforts of the arm's joints."""
         self.held_up: float | None = None
         """Seconds into a motion after which the arm does not follow it."""
         self.abort: tuple[float, int, str] | None = None
@@ -153,4 +160,7 @@ class FakeRobot:
         if not self.without_finger:
             names, q = [*names, self.robot.gripper.fingers[0]], [*q, self.finger]
         stamp = {"sec": sec, "nanosec": nanosec}
-        self._states.put(self._node.types.new(JOINTS, header={"stamp": stamp}, name=names, position=q))
+        efforts = [*self.torques, *[0.0] * (len(names) - len(self.torques))] if self.torques else []
+        for part in (slice(3), slice(3, None)) if self.split else (slice(None),):
+            told = {"name": names[part], "position": q[part], "effort": efforts[part]}
+            self._states.put(self._node.types.new(JOINTS, header={"stamp": stamp}, **told))
