@@ -589,9 +589,9 @@ class Demonstrator(Stage):
 
         What was turned in vain as often as is tried need not show a side any more, until the verdict.
         """
-        self._check_transfer(scene, ctx)
-        self._state = replace(self._state, missing="", searched=())
         held, violated = satisfied(goal, scene, self._catalogue)
+        self._check_transfer(scene, violated, ctx)
+        self._state = replace(self._state, missing="", searched=())
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
         ctx.log(f"scene '{self._state.purpose}': {count}{from_memory}")
@@ -625,7 +625,7 @@ class Demonstrator(Stage):
             return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
         return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
 
-    def _check_transfer(self, scene: SceneGraph, ctx: Context) -> None:
+    def _check_transfer(self, scene: SceneGraph, violated: Sequence[Assertion], ctx: Context) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan.
 
         Done is what was felt to stand and is then seen there; what the hand did not feel the look decides.
@@ -639,6 +639,10 @@ class Demonstrator(Stage):
             complaint = ""
         if not complaint and not _reached(transfer, scene):
             complaint = f"release: {transfer.object} is not seen on or in {transfer.destination}"
+        actions = transfer.place.split()
+        beside = [one for one in violated if one.predicate == "in" and one.arguments[0] in actions]
+        if not complaint and any(one.arguments[1] == transfer.object for one in beside):
+            complaint = f"release: {beside[0]} does not hold"
         now = next((item for item in scene.objects if item.name == transfer.object), None)
         wanted = transfer.T_base_targets[0]
         if not complaint and now and is_tipped(self._catalogue[now.label], now.T_base_object, wanted):

@@ -135,9 +135,11 @@ class Planner(Stage):
         for scene in (task.goal, task.current):
             if scene.frame != "base":
                 return _answer("refused", "", reason=_nowhere(scene))
+        there = {item.name for item in task.current.objects}
+        task = replace_fields(task, avoid=tuple(key for key in task.avoid if _moved(key)[0] in there))
         if task.aside:
             return self._put_aside(task, ctx)
-        missing = {item.name for item in task.goal.objects} - {item.name for item in task.current.objects}
+        missing = {item.name for item in task.goal.objects} - there
         if missing:
             return _answer("refused", "", reason=f"the goal needs {_listed(missing)}, not in the current scene")
         plan = self._plan(task, task.goal, ctx)
@@ -223,7 +225,7 @@ class Planner(Stage):
         if not free:
             return _answer("refused", "", reason=f"wherever {step.item} could be put, it would hide the same")
         chosen = np.stack(free[: self._config.workspace.targets])
-        return _answer("solved", "", transfers=[_transfer(step, chosen, problem)])
+        return _answer("solved", "", transfers=[_transfer(step, chosen, problem, faces=False)])
 
     def _problem(self, task: Task, held: Sequence[Assertion]) -> Problem:
         regions = {item.name for item in task.goal.virtual_objects}
@@ -352,7 +354,7 @@ class Planner(Stage):
         return search.with_engine(self._config.engine, text, attempt.problem)
 
 
-def _transfer(step: Step, T_base_targets: Floats, problem: Problem) -> Transfer:
+def _transfer(step: Step, T_base_targets: Floats, problem: Problem, *, faces: bool) -> Transfer:
     pick, place = search.actions(step, problem)
     return Transfer(
         object=step.item,
@@ -361,12 +363,18 @@ def _transfer(step: Step, T_base_targets: Floats, problem: Problem) -> Transfer:
         T_base_targets=T_base_targets,
         pick=pick,
         place=place,
-        faces=step.item in problem.faced,
+        faces=faces,
     )
 
 
 def _solved(steps: Iterable[tuple[Step, Floats]], text: str, problem: Problem, *, expanded: int = 0) -> Plan:
-    transfers = [_transfer(step, poses, problem) for step, poses in steps]
+    """On its last way an object comes to show the side that the goal has, not before."""
+    every = list(steps)
+    last = {step.item: number for number, (step, _) in enumerate(every) if step.item in problem.faced}
+    transfers = [
+        _transfer(step, poses, problem, faces=last.get(step.item) == number)
+        for number, (step, poses) in enumerate(every)
+    ]
     return _answer("solved", text, transfers=transfers, expanded=expanded)
 
 

@@ -125,7 +125,7 @@ class Doubt(Struct, frozen=True, kw_only=True):
     @property
     def key(self) -> str:
         """Equal for doubts that one answer settles."""
-        return f"{self.kind} {self.object}".strip()
+        return " ".join(filter(None, (self.kind, self.object, self.stance if self.kind == "stance" else "")))
 
 
 class SceneGraph(Message, frozen=True, kw_only=True):

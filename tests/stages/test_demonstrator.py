@@ -306,6 +306,21 @@ def test_what_was_put_aside_after_failures_is_not_put_aside_again() -> None:
     assert isinstance(task, Task) and task.avoid == (STEP.key,)
 
 
+def test_a_transfer_that_ends_outside_its_region_counts_as_failed() -> None:
+    def off(item: SceneObject) -> SceneObject:
+        away = pose(item.T_base_object[:3, :3], item.T_base_object[:3, 3] + [0.0, 0.3, 0.0])
+        return msgspec.structs.replace(item, T_base_object=away) if item.name == "soup_can" else item
+
+    episode, beyond = Episode(tries=1), msgspec.structs.replace(GOAL, objects=tuple(map(off, GOAL.objects)))
+    episode.until_task(start=beyond)
+    place = "(place-at-region soup_can soup_can_near_tray tray table)"
+    step = msgspec.structs.replace(transfer("soup_can", "table", "table"), place=place)
+    episode.planned(step)
+    episode.ended(1, step)
+    (task,) = episode.seen(beyond)
+    assert isinstance(task, Task) and task.avoid == (step.key,)
+
+
 def test_a_transfer_that_misses_its_relation_counts_as_failed() -> None:
     episode = Episode(tries=1)
     episode.until_transfer()

@@ -213,6 +213,14 @@ def test_an_object_is_turned_to_the_side_that_the_goal_has(side: Side):
         assert not satisfied(goal, executed(start, found, which=which).graph(), catalogue())[1]
 
 
+def test_on_its_way_by_a_place_aside_an_object_may_show_any_side():
+    start, key = Layout().put("sugar_box", 0.0, 0.1).put("tea_box", 0.1, -0.2), "tea_box: table -> table"
+    goal = faced(start.graph(), "tea_box", "left")
+    task = Task(goal_name="goal", goal=goal, current=start.graph(), avoid=(key, key))
+    found = planner().on_task(task, Recorded())
+    assert [(transfer.key, transfer.faces) for transfer in found.transfers] == [(key, False), (key, True)]
+
+
 def test_what_may_be_anywhere_is_turned_on_the_table():
     start = Layout().put("tray", 0.1, 0.1).put("tea_box", 0.0, 0.0, on="tray")
     goal = without(faced(start.graph(), "tea_box", "left"), "in(tea_box, tray)")
@@ -367,6 +375,12 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     found = plan(crowded_goal(), near, avoid=("tea_box: table -> tray",))
     again = [transfer.key for transfer in found.transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
+
+
+def test_what_failed_and_is_gone_is_no_reason_not_to_plan():
+    goal, gone = breakfast().graph(), ("mug: table -> table", "mug: table -> table")
+    task = Task(goal_name="goal", goal=goal, current=START.graph(), avoid=gone)
+    assert "mug" not in START.poses and planner().on_task(task, Recorded()).status == "solved"
 
 
 def test_a_transfer_that_failed_in_other_places_too_is_made_by_way_of_a_place_aside():

@@ -108,14 +108,14 @@ def opening(world: CollisionWorld, grasp: Grasp, room: float) -> float:
 
 
 class PickPlacePlanner:
-    """Searches grasps in the user's order; ``obstacle`` tells how far the search came."""
+    """Searches the grasps that the gripper takes, in the user's order; ``obstacle`` tells how far the search came."""
 
     def __init__(self, world: CollisionWorld, errand: Errand, rng: np.random.Generator, *, room: float) -> None:
         """``room``: see :class:`Margins`."""
         self._world, self._errand, self._rng, self._room = world, errand, rng, room
         self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
         self._entry = errand.entry.without_symmetries() if errand.faces else errand.entry
-        self._grasps = distinct_grasps(self._entry)
+        self._grasps = [one for one in distinct_grasps(self._entry) if one.width <= world.robot.gripper.widest]
         self._first_picks: dict[str, Pick | None] = {}
 
     def plans(self, start: Floats) -> Iterator[PickPlace]:

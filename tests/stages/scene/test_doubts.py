@@ -37,7 +37,7 @@ def test_an_object_that_may_stand_otherwise_is_asked_about() -> None:
         (LYING, TURNED, "lying"),
     ):
         (doubt,) = doubts(estimate("cup", pose, (pose, 0.4), (other, 0.3)), CATALOGUE)
-        assert (doubt.key, doubt.stance, doubt.choices) == ("stance cup", stance, ("yes", "no", "again"))
+        assert (doubt.key, doubt.stance, doubt.choices) == (f"stance cup {stance}", stance, ("yes", "no", "again"))
         assert doubt.T_base_other is not None and np.allclose(doubt.T_base_other, other)
 
 

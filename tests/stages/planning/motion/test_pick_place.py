@@ -10,7 +10,8 @@ from stages.geometry.poses import inverse, raised
 from stages.messages import Transfer
 from stages.planning.motion.collision import CollisionWorld
 from stages.planning.motion.motion import is_motion_free
-from stages.planning.motion.pick_place import SLID, PickPlacePlanner, planners
+from stages.planning.motion.pick_place import SLID, Errand, PickPlacePlanner, planners
+from stages.robots import BUILT_IN, read_robot
 from tests.stages.planning.scenes import ROBOT, TABLE, catalogue, standing
 
 
@@ -59,3 +60,15 @@ def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> Non
     hanging = raised(hand.T_base_hand @ inverse(hand.T_object_hand), -SLID)
     with world.holding(inverse(hand.T_base_hand) @ hanging, hand.grasp.width):
         assert is_motion_free(world, plan.carry)
+
+
+def test_what_the_gripper_does_not_take_is_no_grasp() -> None:
+    box = catalogue()["sugar_box"]
+    robot = read_robot(BUILT_IN.with_name("ur5e.yaml"))
+    assert any(grasp.width > robot.gripper.widest for grasp in box.grasps)
+    T = standing("sugar_box", 0.5, 0.1, height=robot.table.height)
+    world = CollisionWorld(robot, robot.table, {"sugar_box": (box, T)}, carried="sugar_box")
+    errand = Errand(box, T, T[None], "table", "table")
+    planner = PickPlacePlanner(world, errand, np.random.default_rng(0), room=0.006)
+    widths = [grasp.width for grasp in planner._grasps]  # pyright: ignore[reportPrivateUsage]
+    assert widths and max(widths) <= robot.gripper.widest
