@@ -73,7 +73,7 @@ class Workspace:
     """Least gap between footprints."""
     edge: float = 0.02
     """Least distance of a footprint from the edge of the table, as far as that was seen."""
-    spacing: float = 0.06
+    spacing: float = CROWDED
     """Gap that objects put aside should keep."""
     targets: int = 12
     """Poses offered for each transfer."""

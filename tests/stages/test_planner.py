@@ -21,7 +21,7 @@ from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
 from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Step
-from stages.planning.targets import Crowded, Next, Targets, Workspace
+from stages.planning.targets import Crowded, Next, Targets, Workspace, neighbours
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
@@ -375,6 +375,9 @@ def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     found = plan(crowded_goal(), near, avoid=("tea_box: table -> tray",))
     again = [transfer.key for transfer in found.transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
+    moved = next(transfer for transfer in found.transfers if transfer.key == "water_bottle: table -> table")
+    after = executed(near, msgspec.structs.replace(found, transfers=(moved,)))
+    assert neighbours("tea_box", Scene.of(after.graph(), {label: stances(label) for label in after.poses})) == []
 
 
 def test_what_failed_and_is_gone_is_no_reason_not_to_plan():
