@@ -392,9 +392,7 @@ class Demonstrator(Stage):
         """Looks at what the transfer did, whatever the hand has felt."""
         stands = outcome.failed_stage in STANDS or outcome.held
         if stands and self._state.phase in (Phase.TRANSFERRING, Phase.RECOVERING):
-            self._state = replace(self._state, halted=True)
-            stage = STOPPED if outcome.failed_stage == STOPPED else "executor"
-            return self._conclude(stage, outcome.reason, ctx)
+            return self._stands(outcome.failed_stage, outcome.reason, ctx)
         if self._state.phase is Phase.RECOVERING:
             return self._recovered(outcome, ctx)
         if self._state.phase is not Phase.TRANSFERRING or outcome.number != self._state.transfers:
@@ -419,8 +417,12 @@ class Demonstrator(Stage):
         self._state = replace(self._state, astray="" if arrived.success else arrived.reason)
         if arrived.stopped not in STANDS or self._state.phase is not Phase.LOOKING:
             return None
+        return self._stands(arrived.stopped, arrived.reason, ctx)
+
+    def _stands(self, why: str, reason: str, ctx: Context) -> Verdict:
+        """The end of a task whose arm stands where it is."""
         self._state = replace(self._state, halted=True)
-        return self._conclude(STOPPED if arrived.stopped == STOPPED else "executor", arrived.reason, ctx)
+        return self._conclude(STOPPED if why == STOPPED else "executor", reason, ctx)
 
     def _recovered(self, outcome: Outcome, ctx: Context) -> LookRequest | Verdict:
         """The arm is at home again, or not."""

@@ -15,6 +15,7 @@ from runner.contract import Refused
 from runner.process.children import ENVIRONMENT, bound
 
 END_SECONDS = 5.0
+"""What the page may take to end in order."""
 NEEDED = ("PIL", "starlette", "uvicorn", "websockets")
 
 

@@ -36,12 +36,10 @@ DESCENT = "RUNNER_DESCENT"
 """Names the variable that tells of which processes of runs a process descends, in whatever session or group it is."""
 DESCENDANT_GRACE_SECONDS = 0.5
 """What a descendant that is asked to end gets to clean up before it is killed."""
-DESCENDANT_DEATH_SECONDS = 3.0
-"""After that one is given up: the kernel holds it."""
+DEATH_SECONDS = 3.0
+"""After that what was killed is given up: the kernel holds it."""
 LOOK_SECONDS = 0.01
 """Between two looks for descendants. Two must find none: one that is just replaced by another program shows nothing."""
-DEATH_SECONDS = 3.0
-"""What a killed process may take until it has gone."""
 LONGEST_PAUSE_SECONDS = 0.02
 """Between two looks whether a process has ended."""
 SHOWN_CHARACTERS = 100
@@ -162,7 +160,7 @@ def end_descendants(mark: str) -> list[str]:
     lines. What has cleared its environment is not found."""
     ended: dict[int, str] = {}
     start, clear = time.monotonic(), 0
-    while clear < 2 and (passed := time.monotonic() - start) < DESCENDANT_DEATH_SECONDS:
+    while clear < 2 and (passed := time.monotonic() - start) < DEATH_SECONDS:
         found = _descendants(mark)
         for pid in found:
             if passed > DESCENDANT_GRACE_SECONDS:

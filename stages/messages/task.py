@@ -14,9 +14,9 @@ FailedStage = Literal[
 off, see :data:`stages.messages.robot.Stopped`."""
 
 STOPPED = "stop"
+"""Stands where an outcome or a verdict names the stage that failed: somebody asked to stop."""
 STANDS = (STOPPED, "fault")
 """Why an arm stands where it is until it is to recover."""
-"""Stands where an outcome or a verdict names the stage that failed: somebody asked to stop."""
 
 
 class Arrangement(Message, frozen=True, kw_only=True):

@@ -55,13 +55,14 @@ class Scene:
         """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy; what hangs in
         the air stays there, for it stands on something that was not seen."""
         standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
-        poses = {item.name: item.T_base_object for item in graph.objects}
+        T_table_base = inverse(graph.T_base_table)
+        poses = {item.name: T_table_base @ item.T_base_object for item in graph.objects}
         scene = Scene({}, carriers(graph), graph.T_base_table, graph.support, _eye(graph))
         while standing:
             name = next(name for name in standing if scene.supports[name] not in standing)
             item, support = standing.pop(name), scene.supports[name]
             rested = scene.rested(item, support)
-            leaning = _leaning(item, inverse(graph.T_base_table) @ poses[name])
+            leaning = _leaning(item, poses[name])
             rested = replace(item if _hangs(item, rested) else rested, T_table_leaning=leaning)
             scene = scene.after(name, rested, support)
         return scene
