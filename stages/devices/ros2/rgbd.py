@@ -73,6 +73,12 @@ def frame_of(
             f"{source.depth}: {_size(metres)} pixels, but {source.color} has {_size(rgb)}; depth must be registered to "
             "colour"
         )
+    own, wanted = pair.depth.header.frame_id, pair.color.header.frame_id
+    if own != wanted and not source.registered:
+        raise Unusable(
+            f"{source.depth}: is of frame {own!r}, but {source.color} of {wanted!r}; depth must be registered to "
+            "colour: choose the aligned topic (align_depth.enable:=true), or set topics.registered=true where it is"
+        )
     if (info.height, info.width) != metres.shape:
         raise Unusable(f"{source.info}: speaks of {info.width} x {info.height} pixels, the image has {_size(rgb)}")
     rgb, metres = bent.straighten(rgb, metres)
@@ -80,7 +86,7 @@ def frame_of(
         rgb=rgb,
         depth=metres,
         K=K,
-        T_base_camera=camera_pose(source, pair.color.header.frame_id, pair.stamp_ns, transforms),
+        T_base_camera=camera_pose(source, wanted, pair.stamp_ns, transforms),
         robot_mask=None,
         name=name,
         index=index,

@@ -50,6 +50,8 @@ class Source:
     depth: str = "/camera/camera/aligned_depth_to_color/image_raw"
     """Image, or CompressedImage where the name ends in /compressedDepth."""
     info: str = "/camera/camera/color/camera_info"
+    registered: bool = False
+    """Depth is registered to colour though its messages name another frame than those of colour."""
     rectified: bool = False
     """The images are rectified already: their lens is not taken out, and K is that of the projection matrix."""
     slop: float = 0.005

@@ -29,14 +29,14 @@ def header(stamp_ns: int, frame: str = CAMERA) -> dict[str, Any]:
     return {"stamp": TYPES.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec), "frame_id": frame}
 
 
-def image(pixels: np.ndarray, encoding: str, stamp_ns: int = START, *, padding: int = 0) -> Any:
+def image(pixels: np.ndarray, encoding: str, stamp_ns: int = START, *, padding: int = 0, frame: str = CAMERA) -> Any:
     """An Image, its lines longer by some bytes of padding."""
     lines = np.ascontiguousarray(pixels).view(np.uint8).reshape(pixels.shape[0], -1)
     padded = np.pad(lines, ((0, 0), (0, padding)), constant_values=255)
     height, width = pixels.shape[:2]
     return TYPES.new(
         "sensor_msgs/msg/Image",
-        header=header(stamp_ns),
+        header=header(stamp_ns, frame),
         height=height,
         width=width,
         encoding=encoding,

@@ -28,6 +28,7 @@ from tests.stages.devices.ros2.bags import (
     write_bag,
 )
 
+OWN = "camera_depth_optical_frame"
 K = np.array([[50.0, 0, 15.5], [0, 50.0, 11.5], [0, 0, 1]])
 RGB = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 DEPTH = np.random.default_rng(1).integers(400, 2000, (24, 32)).astype(np.float32) / np.float32(1000)
@@ -111,7 +112,7 @@ def test_depth_pairs_with_the_nearest_colour(tmp_path: Path) -> None:
 
 def wrong(name: str, messages: list[Stamped]) -> list[Stamped]:
     """A bag with one thing wrong."""
-    millimetres = (DEPTH * 1000).astype(np.uint16)
+    millimetres = np.round(DEPTH * 1000).astype(np.uint16)
     return {
         "no colour": without(messages, SOURCE.color),
         "no info": without(messages, SOURCE.info),
@@ -120,6 +121,7 @@ def wrong(name: str, messages: list[Stamped]) -> list[Stamped]:
         "colour as depth": replaced(messages, {SOURCE.depth: image(RGB, "rgb8")}),
         "depth as colour": replaced(messages, {SOURCE.color: image(millimetres, "16UC1")}),
         "not registered": replaced(messages, {SOURCE.depth: image(millimetres[:12], "16UC1")}),
+        "own frame": replaced(messages, {SOURCE.depth: image(millimetres, "16UC1", frame=OWN)}),
         "other calibration": replaced(messages, {SOURCE.info: info(K, (48, 64))}),
         "another type": replaced(messages, {SOURCE.info: TYPES.new("std_msgs/msg/String")}),
     }[name]
@@ -138,6 +140,11 @@ def wrong(name: str, messages: list[Stamped]) -> list[Stamped]:
             "not registered",
             rf"{SOURCE.depth}: 32 x 12 pixels, but {SOURCE.color} has 32 x 24; depth must be registered",
         ),
+        (
+            "own frame",
+            rf"{SOURCE.depth}: is of frame '{OWN}', but {SOURCE.color} of '{CAMERA}'; depth must be registered to "
+            r"colour: choose the aligned topic \(align_depth.enable:=true\), or set topics.registered=true",
+        ),
         ("other calibration", rf"{SOURCE.info}: speaks of 64 x 48 pixels, the image has 32 x 24"),
         ("another type", rf"{SOURCE.info} is of type std_msgs/msg/String; wanted is sensor_msgs/msg/CameraInfo"),
     ],
@@ -148,6 +155,12 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, name: str, says: str
     with pytest.raises(Refused, match=says) as refused:
         frames(path)
     assert "\n" not in str(refused.value) and str(refused.value).startswith(f"{path}: ")
+
+
+def test_depth_of_another_frame_is_taken_where_somebody_says_that_it_is_registered(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", wrong("own frame", looks(RGB, DEPTH, K, T_base_camera(), STAMPS[:1])))
+    (found,) = frames(path, topics=Source(registered=True))
+    assert np.array_equal(found.depth, DEPTH) and found.T_base_camera == pytest.approx(T_base_camera())
 
 
 def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
