@@ -100,6 +100,23 @@ def test_a_parallel_gripper_closes_on_what_is_there() -> None:
     assert list(goal.command.name) == ["gripper_right_driver_joint"] and goal.command.effort.tolist() == [40.0]
 
 
+@pytest.mark.parametrize(
+    ("unit", "metres", "width", "says"),
+    [
+        ("opening", False, 0.0, "has reached 0.000, but .* at 0.000, which is 85 mm between the fingers where 0 were"),
+        ("joint", True, 0.04, "has reached 0.448, but .* at 0.040, which is 82 mm between the fingers where 40 were"),
+    ],
+)
+def test_a_gripper_and_joint_states_of_two_units_are_named(unit: Any, metres: bool, width: float, says: str) -> None:
+    where = Controllers(efforts=False, gripper_unit=unit)
+    with router() as endpoint, lab(endpoint) as robot, arm(endpoint, where) as stage:
+        robot.metres = metres
+        state = state_of(stage, still(width))
+    assert state.stopped == "fault" and re.search(says, state.reason)
+    assert state.reason.startswith(f"controllers.gripper_unit = {unit!r}: ")
+    assert state.reason.endswith("valid: 'joint', 'opening'")
+
+
 def test_a_goal_has_tolerances_and_the_operators_speed() -> None:
     with router() as endpoint, lab(endpoint) as robot, arm(endpoint, care=Care(speed=0.5, stale=0.8)) as stage:
         robot.q = HOME + 0.02

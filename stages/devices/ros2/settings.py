@@ -89,8 +89,8 @@ class Controllers:
     gripper: str = "/gripper_controller/gripper_cmd"
     gripper_type: Literal["GripperCommand", "ParallelGripperCommand"] = "GripperCommand"
     gripper_unit: Literal["joint", "opening"] = "joint"
-    """What the gripper is told and says: a position of the description's first finger joint, or metres between the
-    fingers."""
+    """What the gripper is told: a position of the description's first finger joint, or metres between the fingers.
+    Joint states always have a position of the joint."""
     gripper_effort: float = 40.0
     """Newtons (newton metres) with which it closes at most."""
     gripper_joint: str = ""

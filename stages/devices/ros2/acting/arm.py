@@ -29,6 +29,8 @@ _SETTLE, _STILL = 0.25, 5e-4
 """For so long an arm has stood that moved by less, seconds, radians (metres). Fingers creep on what they hold."""
 _BESIDE = 0.1
 """Radians (metres) from where a motion begins within which an arm must be: it has not been moved since it was read."""
+_ALIKE, _UNLIKE = 0.003, 0.01
+"""Nearer is what a gripper that has reached its goal may be off, further is another opening, metres."""
 _CODES = {
     -1: "invalid goal",
     -2: "invalid joints",
@@ -223,6 +225,15 @@ class RemoteArm:
         if status != "succeeded" and not result.stalled:
             raise _Broken("fault", f"{controllers.gripper}: {status}")
         yield from self._rest()
+        position, opening = float(self._joints.positions([self._finger])[0]), self.opening()
+        if result.reached_goal and abs(position - width) < _ALIKE and abs(opening - width) > _UNLIKE:
+            raise _Broken(
+                "fault",
+                f"controllers.gripper_unit = {controllers.gripper_unit!r}: the gripper has reached {told:.3f}, but "
+                f"{controllers.joint_states} has joint {self._finger!r} at {position:.3f}, which is "
+                f"{1e3 * opening:.0f} mm between the fingers where {1e3 * width:.0f} were wanted: one of the two is in "
+                "another unit; valid: 'joint', 'opening'",
+            )
 
     def _goal(
         self, client: ActionClient, type: str, id: bytes, fields: dict[str, Any], check: _Check

@@ -90,6 +90,8 @@ class FakeRobot:
         self.behind = 0.0
         """Seconds by which their stamps are old."""
         self.without_finger = False
+        self.metres = False
+        """The finger's position is told as metres between the fingers."""
         self.split = False
         """Its joints come in two messages."""
         self.torques: list[float] = []
@@ -158,7 +160,8 @@ class FakeRobot:
         sec, nanosec = divmod(time.time_ns() - int(self.behind * 1e9), 10**9)
         names, q = list(self.robot.joints), self.q.tolist()
         if not self.without_finger:
-            names, q = [*names, self.robot.gripper.fingers[0]], [*q, self.finger]
+            finger = self.robot.gripper.width(self.finger) if self.metres else self.finger
+            names, q = [*names, self.robot.gripper.fingers[0]], [*q, finger]
         stamp = {"sec": sec, "nanosec": nanosec}
         efforts = [*self.torques, *[0.0] * (len(names) - len(self.torques))] if self.torques else []
         for part in (slice(3), slice(3, None)) if self.split else (slice(None),):
