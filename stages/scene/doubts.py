@@ -11,6 +11,7 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import Doubt, SceneObject, Stance
+from stages.scene import virtual
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
 SURE, UNSURE = 0.9, 0.5
@@ -104,10 +105,10 @@ def corrected(scene: SceneGraph, answers: Mapping[str, str], relate: Relate) -> 
     names = meant(answers)
     if not turned and all(a == b for a, b in names.items()):
         return scene
+    named = tuple(msgspec.structs.replace(item, name=names.get(item.name, item.name)) for item in scene.objects)
     objects = tuple(
-        msgspec.structs.replace(
-            item, name=names.get(item.name, item.name), T_base_object=turned.get(item.name, item.T_base_object)
-        )
-        for item in scene.objects
+        msgspec.structs.replace(now, T_base_object=turned.get(item.name, item.T_base_object))
+        for item, now in zip(scene.objects, named, strict=True)
     )
-    return relate(scene, objects)
+    beside = virtual.renamed(scene.virtual_objects, names)
+    return relate(msgspec.structs.replace(scene, objects=named, virtual_objects=beside), objects)

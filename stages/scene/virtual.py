@@ -103,12 +103,16 @@ def _spanning(siblings: Sequence[Standing], gap: float, doubtful: Collection[str
 
 
 def among_neighbours(
-    virtual: Sequence[VirtualObject], found: Mapping[str, Support], poses: Mapping[str, Floats]
+    virtual: Sequence[VirtualObject],
+    found: Mapping[str, Support],
+    poses: Mapping[str, Floats],
+    moved: Collection[str] = (),
 ) -> tuple[VirtualObject, ...]:
     """The regions of those objects that are there, told of what one supporter carries.
 
-    ``poses`` are T_base_object by name. What stood beside another object may turn out to stand on a third one, which
-    was not seen: then that is beside it, unless it has its place among the others already.
+    ``poses`` are T_base_object by name; those of the objects that are ``moved`` are not the ones that the regions were
+    told by. What stood beside another object may turn out to stand on a third one, which was not seen: then that is
+    beside it, unless it has its place among the others already.
     """
     placed = {name for item in virtual for name in (item.parent, item.child)}
     told: list[VirtualObject] = []
@@ -117,12 +121,20 @@ def among_neighbours(
         for parent, child in product(*stacks):
             if parent == child or found[parent].parent != found[child].parent:
                 continue
-            if (parent, child) == (item.parent, item.child):
+            if (parent, child) == (item.parent, item.child) and {parent, child}.isdisjoint(moved):
                 told.append(item)
             elif placed.isdisjoint({parent, child} - {item.parent, item.child}):
                 told.append(region(parent, child, inverse(poses[parent]) @ poses[child], item.radius))
                 placed |= {parent, child}
     return tuple(told)
+
+
+def renamed(virtual: Sequence[VirtualObject], names: Mapping[str, str]) -> tuple[VirtualObject, ...]:
+    """The same regions of objects that have new names, by those they had."""
+    return tuple(
+        region(names.get(one.parent, one.parent), names.get(one.child, one.child), one.T_parent_virtual, one.radius)
+        for one in virtual
+    )
 
 
 def _downwards(name: str, found: Mapping[str, Support]) -> list[str]:

@@ -119,12 +119,9 @@ class Memory:
         if all(item.name == name for item, name in zip(scene.objects, names, strict=True)):
             return scene
         now = {item.name: name for item, name in zip(scene.objects, names, strict=True)}
-        beside = tuple(
-            virtual.region(now[item.parent], now[item.child], item.T_parent_virtual, item.radius)
-            for item in scene.virtual_objects
-        )
-        objects = [msgspec.structs.replace(item, name=now[item.name]) for item in scene.objects]
-        return self.related(msgspec.structs.replace(scene, virtual_objects=beside), objects)
+        objects = tuple(msgspec.structs.replace(item, name=now[item.name]) for item in scene.objects)
+        beside = virtual.renamed(scene.virtual_objects, now)
+        return self.related(msgspec.structs.replace(scene, objects=objects, virtual_objects=beside), objects)
 
     def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
         view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
@@ -152,11 +149,14 @@ class Memory:
         return upwards > _THROUGH and regions.separation(a.outline, b.outline) < -depth
 
     def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
-        """The same scene with other objects: what carries what is found anew, regions stay among neighbours."""
+        """The same scene with other objects: what carries what is found anew, regions stay among neighbours, each where
+        these stand now."""
         standing = standing_of(objects, self._stances, scene.T_base_table)
         carried = relations.supports(standing, relations.Tolerances())
         poses = {item.name: item.T_base_object for item in objects}
-        near = virtual.among_neighbours(scene.virtual_objects, carried, poses)
+        before = {item.name: item.T_base_object for item in scene.objects}
+        moved = {name for name in before.keys() & poses.keys() if not np.array_equal(before[name], poses[name])}
+        near = virtual.among_neighbours(scene.virtual_objects, carried, poses, moved)
         return msgspec.structs.replace(
             scene,
             objects=tuple(objects),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
+import pytest
 
 from stages.geometry.arrays import Floats
 from stages.messages import ObjectPose, SceneEstimate
-from stages.messages.scene import Alternative, UnknownRegion
+from stages.messages.scene import Alternative, Doubt, UnknownRegion
+from stages.perception.confidence.memory import Memory
 from stages.scene.catalogue import BUILT_IN, Catalogue
-from stages.scene.doubts import doubts
+from stages.scene.doubts import corrected, doubts
+from tests.stages.layouts import Layout
 
 CATALOGUE = Catalogue.shared(BUILT_IN)
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]])
@@ -54,3 +57,24 @@ def test_what_is_unlikely_or_looks_the_same_is_not() -> None:
 def test_what_is_unknown_is_asked_about_once() -> None:
     (doubt,) = doubts(estimate("cup", UPRIGHT, unknown=2), CATALOGUE)
     assert (doubt.key, doubt.choices) == ("unknown", ("leave", "again"))
+
+
+@pytest.mark.parametrize("name", ["cup", "cereal_box"])
+def test_a_region_is_told_by_the_pose_that_is_answered(name: str) -> None:
+    scene = Layout().put("cereal_box", 0.0, 0.0, yaw=0.4).put("cup", 0.0, 0.1).graph()
+    (other,) = (item.T_base_object @ np.diag([1.0, -1, -1, 1]) for item in scene.objects if item.name == name)
+    doubt = Doubt(kind="stance", object=name, T_base_other=other)
+    after = corrected(msgspec.structs.replace(scene, doubts=(doubt,)), {doubt.key: "no"}, Memory(CATALOGUE).related)
+    poses = {item.name: item.T_base_object for item in after.objects}
+    (region,) = after.virtual_objects
+    assert np.array_equal(poses[name], other)
+    assert np.allclose(poses[region.parent] @ region.T_parent_virtual, poses[region.child])
+
+
+def test_what_stands_beside_the_one_that_is_meant_stays_beside_it() -> None:
+    scene = Layout().put("mug", 0.0, 0.3).put("mug_2", 0.0, -0.2).put("cereal_box", 0.0, -0.3).graph()
+    (before,) = scene.virtual_objects
+    after = corrected(scene, {"which mug": "mug_2"}, Memory(CATALOGUE).related)
+    (region,) = after.virtual_objects
+    assert (before.child, region.child) == ("mug_2", "mug") and region.parent == before.parent == "cereal_box"
+    assert np.array_equal(region.T_parent_virtual, before.T_parent_virtual)

@@ -214,6 +214,19 @@ def test_a_doubtful_pose_gives_way_to_a_sure_one_of_before(probability: float | 
     np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ (true if kept else doubted), atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["sugar_box", "tea_box"])
+def test_a_region_is_told_by_the_pose_that_is_believed(name: str) -> None:
+    true = {"sugar_box": upright("sugar_box", 0.1, 0.0, 0.3), "tea_box": upright("tea_box", 0.0, 0.1, 0.0)}
+    doubted = {**true, name: true[name] @ pose(upright(name, 0.0, 0.0, 0.5)[:3, :3], np.array([0.01, 0.01, 0.0]))}
+    before = {one: msgspec.structs.replace(item, probability=0.99) for one, item in known(true).items()}
+    scene = graph(doubted)
+    doubtful = [msgspec.structs.replace(item, probability=0.6 if item.name == name else 0.99) for item in scene.objects]
+    completed = MEMORY.complete(msgspec.structs.replace(scene, objects=tuple(doubtful)), before, observation(true))
+    (region,), (expected,) = completed.virtual_objects, graph(true).virtual_objects
+    assert region.name == expected.name
+    np.testing.assert_allclose(region.T_parent_virtual, expected.T_parent_virtual, atol=1e-9)
+
+
 def test_a_doubtful_pose_that_reaches_into_what_is_remembered_gives_way_to_a_sure_one_of_before() -> None:
     """Two sponges on each other, taken for one on its edge."""
     layout = Layout().put("sponge_2", 0.0, 0.0).put("sponge", 0.0, 0.0, on="sponge_2")
