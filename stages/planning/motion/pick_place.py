@@ -163,8 +163,8 @@ class PickPlacePlanner:
         return sum(not self._world.objects[name].grasps for name in names), len(names)
 
     def _touched(self, hand: HandPose, start: Floats) -> tuple[str, ...]:
-        """Objects too near the hand or what it holds, also as that is lifted; none where a posture is not reached or
-        something else is too near."""
+        """Objects too near the hand or what it holds, also as that is lifted but for what gives way then; none where a
+        posture is not reached or something else is too near."""
         world = self._world
         world.set_width(opening(world, hand.grasp, self._room))
         placing = [self.holding(hand), world.resting(self._errand.destination)]
@@ -175,7 +175,9 @@ class PickPlacePlanner:
             found = [self._near(T, start) for T in (hand.T_base_hand, before)]
         if not self._is_picked:
             with self.holding(hand), world.resting(self._errand.source):
-                found += [self._near(raised(hand.T_base_hand, height), start) for height in _LIFTED]
+                q = next(self._postures(hand.T_base_hand, start), None)
+                with world.resting(*(() if q is None else self._leaning(q))):
+                    found += [self._near(raised(hand.T_base_hand, height), start) for height in _LIFTED]
         return () if None in found else tuple(sorted(set[str]().union(*filter(None, found))))
 
     def _near(self, T_base_hand: Floats, start: Floats) -> set[str] | None:
@@ -243,11 +245,14 @@ class PickPlacePlanner:
     def _lift(self, hand: HandPose, q: Floats) -> Floats | None:
         """Straight up from joint positions ``q``; what leans on the object, or it on that, gives way if need be."""
         world, heights = self._world, (LIFT, LIFT / 2)
-        with self.holding(hand), world.resting(self._errand.source):
-            leaning = world.touched(q) if world.clearance == MARGINS[-1].clearance else ()
-            with world.resting(*leaning):
-                lifts = (straight_motion(world, q, raised(hand.T_base_hand, height)) for height in heights)
-                return next((found for found in lifts if found is not None), None)
+        with self.holding(hand), world.resting(self._errand.source), world.resting(*self._leaning(q)):
+            lifts = (straight_motion(world, q, raised(hand.T_base_hand, height)) for height in heights)
+            return next((found for found in lifts if found is not None), None)
+
+    def _leaning(self, q: Floats) -> set[str]:
+        """What leans on the held object, or that on it, at joint positions ``q`` (J) of the grasp; with the least
+        margins alone it gives way as the object is lifted."""
+        return self._world.touched(q) if self._world.clearance == MARGINS[-1].clearance else set()
 
     def _postures(self, T_base_hand: Floats, *first: Floats) -> Iterator[Floats]:
         """Joint positions (J) with the hand at a pose, collisions or not."""

@@ -51,6 +51,21 @@ def test_an_object_that_something_leans_on_is_lifted_with_the_least_margins(gap:
     assert found == ([False, False, True] if gap < 0.002 else [True, True, True])
 
 
+def test_what_only_leans_on_an_object_is_not_in_the_way_of_what_lifts_it() -> None:
+    """A box with a sponge at its foot, under a tray."""
+    entries = catalogue()
+    beside = (entries["tea_box"].dimensions[1] + entries["sponge"].dimensions[1]) / 2 + 0.001
+    above = TABLE.height + entries["tea_box"].dimensions[2] + 0.03
+    poses = {
+        "tea_box": standing("tea_box", 0.65, 0.1),
+        "sponge": standing("sponge", 0.65, 0.1 + beside),
+        "tray": standing("tray", 0.65, 0.1, height=above),
+    }
+    *_, (_, planner) = ways("tea_box", poses, standing("tea_box", 0.65, -0.2))
+    assert not planner.reaches(0, ROBOT.home)
+    assert planner.in_the_way(ROBOT.home) == ("tray",)
+
+
 def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> None:
     """A carton around a box that it would pass 4 cm above."""
     poses = {"milk_carton": standing("milk_carton", 0.6, 0.25), "tea_box": standing("tea_box", 0.6, 0.0)}
