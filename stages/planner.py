@@ -29,7 +29,7 @@ from stages.robots import BUILT_IN, read_robot
 from stages.scene.catalogue import Catalogue
 from stages.scene.domain import DOMAIN
 from stages.scene.facing import sides
-from stages.scene.stance import Stances, Standing
+from stages.scene.stance import Stances, Standing, standing_of
 from stages.scene.virtual import fallen, rerooted, satisfied
 
 SEARCHES = 16
@@ -236,8 +236,17 @@ class Planner(Stage):
             held=frozenset(child for region, child in inside if region in regions),
             graspable=frozenset(item.name for item in task.current.objects if not self._why_not(item.label)),
             turned=fallen(task.goal, task.current, self._catalogue).intersection(wanted(task.goal))
-            | frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"},
+            | frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"}
+            | self._leaning(task, held),
         )
+
+    def _leaning(self, task: Task, held: Sequence[Assertion]) -> frozenset[str]:
+        """What leans and does not carry what it should: nothing can be put there before it is set upright."""
+        there, belongs = {item.arguments for item in held if item.predicate in ("on", "in")}, wanted(task.goal)
+        lacking = {support for item, support in belongs.items() if (item, support) not in there}
+        standing = standing_of(task.current.objects, self._stances, task.current.T_base_table)
+        leaning = {item.name for item in standing if item.stance.item.grasps and not item.stance.aligned}
+        return frozenset(lacking & leaning & belongs.keys())
 
     def _why_not(self, label: str) -> str:
         """Why the robot cannot grasp an object; empty where it can."""

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from runner.contract import Refused
 from stages.devices.suites import tray
 from stages.geometry import regions
+from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
 from stages.messages import Plan, Task
 from stages.messages.scene import Side, UnknownRegion
@@ -694,6 +696,31 @@ def test_what_lies_and_stood_is_set_upright_before_something_goes_beside_it():
     ups = [transfer.T_base_targets[:, 2, 2] for transfer in found.transfers]
     assert np.concatenate(ups) == pytest.approx(1.0)
     assert reached(goal, executed(start, found))
+
+
+@pytest.mark.parametrize("degrees", [16, 22, 29])
+def test_what_leans_is_set_upright_before_something_goes_in_it(degrees: float):
+    goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, 0.0, on="bowl")
+    start = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, -0.2)
+    start.poses["bowl"] = leaning("bowl", start.poses["bowl"], degrees)
+    found = plan(goal, start)
+    assert [transfer.object for transfer in found.transfers] == ["bowl", "cup"], found.reason
+    assert reached(goal, executed(start, found))
+
+
+def test_what_leans_and_carries_what_it_should_stays():
+    goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, 0.0)
+    start = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, -0.2)
+    start.poses["bowl"] = leaning("bowl", start.poses["bowl"], 20)
+    assert [transfer.object for transfer in plan(goal, start).transfers] == ["cup"]
+
+
+def leaning(name: str, T_table_object: Floats, degrees: float) -> Floats:
+    """The pose of an object on the table that has tilted by so much, about the table's y axis."""
+    T = T_table_object.copy()
+    T[:3, :3] = Rotation.from_rotvec([0.0, np.deg2rad(degrees), 0.0]).as_matrix() @ T[:3, :3]
+    T[2, 3] = -(catalogue()[name].mesh.vertices @ T[2, :3]).min()
+    return T
 
 
 def test_what_no_hand_turns_at_once_is_laid_down_on_another_side_first():
