@@ -335,7 +335,7 @@ class Targets:
         """
         seen_first = self._seen_first(step, scene) if step.region else None
         margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
-        if step.destination != TABLE and _fits(scene.standing[step.item], scene.standing[step.destination]):
+        if step.destination != TABLE and scene.standing[step.destination].fits(scene.standing[step.item].bottom):
             margins = margins[:2]
         found: Found = [], ()
         for margin in margins:
@@ -390,7 +390,8 @@ class Targets:
         return valid + beyond[: self._workspace.targets], blocking
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
-        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle.
+        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle. What would
+        lie on a rim lies there on both sides: on one it would tip into the hollow.
 
         The table always carries all of it, not far beyond where the arm is known to reach.
         """
@@ -406,7 +407,9 @@ class Targets:
             return regions.inside(item.bottom, surface, margin=margin)
         middles = np.stack([regions.centroid(item.bottom), regions.centroid(surface)])
         depth, deepest = regions.depth(surface, middles)
-        return bool(depth >= min(MIDDLE, 0.5 * deepest))
+        if depth < min(MIDDLE, 0.5 * deepest):
+            return False
+        return carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
@@ -488,14 +491,6 @@ def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:
 def _alike_from(number: int, places: Sequence[Standing]) -> list[Standing]:
     """One of the places, and those after it where the object stands on the same side."""
     return [place for place in places[number:] if place.stance is places[number].stance]
-
-
-def _fits(item: Standing, carrier: Standing) -> bool:
-    """Whether the object finds room on the floor of a hollow, so that it need not lean on its wall."""
-    if carrier.stance.cavity is None:
-        return False
-    middle = regions.centroid(carrier.floor) - regions.centroid(item.bottom)
-    return regions.inside(item.bottom + middle, carrier.floor)
 
 
 def neighbours(name: str, scene: Scene) -> list[str]:

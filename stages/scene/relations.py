@@ -78,19 +78,11 @@ def gaps(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: T
 
 
 def _surface(carrier: Standing | None, item: Standing) -> float:
-    """Height above the table at which a carrier (None: the table) bears an object: its floor, unless its rim does."""
+    """Height above the table up to which a carrier (None: the table) may bear an object: its floor, unless that may
+    lean on its wall all round, or lie on its rim."""
     if carrier is None:
         return 0.0
-    return carrier.z_top if _rim_bears(carrier, item) else carrier.rest_height(item.bottom)
-
-
-def _rim_bears(carrier: Standing, item: Standing) -> bool:
-    """Whether the bottom lies on the rim all round or on two sides; one that overhangs a side would tip inwards."""
-    common = regions.overlap(item.bottom, carrier.top)
-    if not (len(common) and len(carrier.floor)):
-        return False
-    rests = regions.hull(common[regions.depth(carrier.floor, common) < 0])
-    return regions.inside(regions.centroid(common)[None], rests)
+    return carrier.z_top if carrier.rim_bears(item.bottom, carrier.floor) else carrier.rest_height(item.bottom)
 
 
 def _supporters(standing: Sequence[Standing], tolerances: Tolerances) -> dict[str, dict[str, float]]:

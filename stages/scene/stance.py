@@ -40,6 +40,8 @@ class Cavity:
     """Lowest point, metres above the object's origin."""
     region: Region
     """Where the floor is."""
+    opening: Region
+    """What the rim surrounds: all that is lower, seen from above."""
     samples: Floats
     """N x 3: points of the upper surface inside ``region``."""
 
@@ -132,7 +134,11 @@ def _cavity(stance: Stance) -> Cavity | None:
         return None
     over_floor = regions.depth(region, surface[:, :2]) >= -1e-9
     filled = float(low[over_floor].mean()) > DISH_FILL
-    return Cavity(floor, region, surface[low]) if filled or stance.item.concave else None
+    if not filled and not stance.item.concave:
+        return None
+    lower = surface[surface[:, 2] < stance.high - DISH_DEPTH, :2]
+    within = regions.depth(stance.top, lower) >= 0  # A handle is beside the rim.
+    return Cavity(floor, region, regions.hull(lower[within]), surface[low])
 
 
 def _upper_surface(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
@@ -275,10 +281,34 @@ class Standing:
         cavity = self.stance.cavity
         return regions.moved(cavity.region, self.T_table_stance) if cavity else regions.EMPTY
 
+    def centred(self, bottom: Region) -> Region:
+        """A bottom (table frame) moved to the middle of the cavity's floor; as it is where there is no cavity."""
+        return bottom + regions.centroid(self.floor) - regions.centroid(bottom) if len(self.floor) else bottom
+
+    def fits(self, bottom: Region) -> bool:
+        """Whether a bottom (table frame) finds room on the cavity's floor, so that it need not lean on its wall."""
+        return regions.inside(self.centred(bottom), self.floor)
+
+    def rim_bears(self, bottom: Region, hollow: Region) -> bool:
+        """Whether a bottom lies on the rim around a ``hollow`` (both in the table frame) all round or on two sides; one
+        that overhangs a side would tip inwards."""
+        common = regions.overlap(bottom, self.top)
+        if not (len(common) and len(hollow)):
+            return False
+        rests = regions.hull(common[regions.depth(hollow, common) < 0])
+        return regions.inside(regions.centroid(common)[None], rests)
+
+    def lies_on_rim(self, bottom: Region) -> bool:
+        """Whether a bottom (table frame) neither fits on the cavity's floor nor sinks into its opening."""
+        cavity = self.stance.cavity
+        if cavity is None or self.fits(bottom):
+            return False
+        return self.rim_bears(bottom, regions.moved(cavity.opening, self.T_table_stance))
+
     def rest_height(self, region: Region) -> float:
         """Height above the table at which a flat bottom over ``region`` (table frame) rests on or in this object."""
         cavity = self.stance.cavity
-        if cavity is None:
+        if cavity is None or self.lies_on_rim(region):
             return self.z_top
         return self.z + cavity.height(regions.moved(region, inverse(self.T_table_stance)))
 

@@ -257,6 +257,18 @@ def test_heights_come_from_the_catalogue_and_not_from_the_estimate():
     assert noisy == pytest.approx(exact, abs=1e-9)
 
 
+@pytest.mark.parametrize(("lower", "upper", "resting"), [("cup", "sponge", 0), ("bowl", "tea_box", 1)])
+def test_what_lies_on_a_rim_is_placed_on_it(lower: str, upper: str, resting: int):
+    goal = Layout().put(lower, 0.0, 0.1).put(upper, 0.0, 0.1, resting=resting)
+    goal.poses[upper][2, 3] += np.ptp(catalogue()[lower].mesh.vertices[:, 2])
+    start = Layout().put(lower, 0.0, 0.1).put(upper, 0.0, -0.2, resting=resting)
+    found = plan(goal, start)
+    (transfer,) = found.transfers
+    assert transfer.destination == lower
+    assert transfer.T_base_targets[:, 2, 3] - T_BASE_TABLE[2, 3] == pytest.approx(goal.poses[upper][2, 3], abs=2e-3)
+    assert reached(goal, executed(start, found))
+
+
 def test_what_stands_on_a_goal_object_is_put_aside_and_stays_within_reach():
     goal = Layout().put("tea_box", 0.0, 0.0).put("tuna_can", 0, 0, on="tea_box")
     start = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box").put("tuna_can", 0.1, 0.2)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stages.scene.relations import Tolerances, gaps, penetration
 from stages.scene.stance import Standing
-from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, stances
+from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, label_of, stances
 
 SCENES = {
     "breakfast": (
@@ -134,6 +134,36 @@ def test_a_bowl_carries_a_wide_bottom_higher_than_a_narrow_one():
     bowl = Standing.at("bowl", stances("bowl"), np.eye(4))
     cup, shaker = (Standing.at(name, stances(name), np.eye(4)) for name in ("cup", "salt_shaker"))
     assert bowl.z_floor < bowl.rest_height(shaker.bottom) < bowl.rest_height(cup.bottom) < bowl.z_top
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "resting"),
+    [("bowl", "tea_box", 1), ("cup", "sponge", 0), ("mug", "cereal_box", 1), ("cup", "plate", 0), ("plate", "tray", 0)],
+)
+def test_what_reaches_over_a_rim_rests_on_it(lower: str, upper: str, resting: int):
+    layout = Layout().put(lower, 0, 0).put(upper, 0, 0, resting=resting)
+    below, above = (Standing.at(name, stances(name), T) for name, T in layout.poses.items())
+    assert below.rest_height(above.bottom) == pytest.approx(below.z_top)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "x", "y", "height"),
+    [
+        ("cup", "cup_2", 0.0, 0.0, 0.034),
+        ("mug", "soup_can", -0.0153, 0.0, 0.005),
+        ("bowl", "sponge", 0.0, 0.0, 0.024),
+        ("plate", "milk_carton", 0.0, 0.0, 0.006),
+        ("tray", "sponge", -0.144, -0.103, 0.006),
+        ("tray", "sponge", -0.165, 0.0, 0.006),
+    ],
+)
+def test_what_sinks_into_an_opening_or_overhangs_one_side_rests_below_the_rim(
+    lower: str, upper: str, x: float, y: float, height: float
+):
+    """Also what was estimated a centimetre into two walls of a tray."""
+    layout = Layout().put(lower, 0, 0).put(upper, x, y)
+    below, above = (Standing.at(name, stances(label_of(name)), T) for name, T in layout.poses.items())
+    assert below.rest_height(above.bottom) - below.z_bottom == pytest.approx(height, abs=0.005)
 
 
 @pytest.mark.parametrize("carrier", ["", "cereal_box", "tray"])
