@@ -230,23 +230,27 @@ class Planner(Stage):
     def _problem(self, task: Task, held: Sequence[Assertion]) -> Problem:
         regions = {item.name for item in task.goal.virtual_objects}
         inside = (item.arguments for item in held if item.predicate == "in")
+        graspable = frozenset(item.name for item in task.current.objects if not self._why_not(item.label))
         return Problem.between(
             task.current,
             task.goal,
             held=frozenset(child for region, child in inside if region in regions),
-            graspable=frozenset(item.name for item in task.current.objects if not self._why_not(item.label)),
+            graspable=graspable,
             turned=fallen(task.goal, task.current, self._catalogue).intersection(wanted(task.goal))
             | frozenset(sides(task.goal)) - {item.arguments[0] for item in held if item.predicate == "faces"}
-            | self._leaning(task, held),
+            | self._leaning(task, held) & graspable,
         )
 
     def _leaning(self, task: Task, held: Sequence[Assertion]) -> frozenset[str]:
-        """What leans and does not carry what it should: nothing can be put there before it is set upright."""
+        """What leans as the goal does not show it, and does not carry what it should: nothing can be put there before
+        it is set upright."""
         there, belongs = {item.arguments for item in held if item.predicate in ("on", "in")}, wanted(task.goal)
         lacking = {support for item, support in belongs.items() if (item, support) not in there}
-        standing = standing_of(task.current.objects, self._stances, task.current.T_base_table)
-        leaning = {item.name for item in standing if item.stance.item.grasps and not item.stance.aligned}
-        return frozenset(lacking & leaning & belongs.keys())
+        straight, shown = (
+            {item.name for item in standing_of(scene.objects, self._stances, scene.T_base_table) if item.stance.aligned}
+            for scene in (task.current, task.goal)
+        )
+        return frozenset(lacking & shown - straight).intersection(belongs)
 
     def _why_not(self, label: str) -> str:
         """Why the robot cannot grasp an object; empty where it can."""

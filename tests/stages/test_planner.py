@@ -720,10 +720,13 @@ def test_what_leans_is_set_upright_before_something_goes_in_it(degrees: float):
     assert reached(goal, executed(start, found))
 
 
-def test_what_leans_and_carries_what_it_should_stays():
-    goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, 0.0)
+@pytest.mark.parametrize("shown", [False, True])
+def test_what_leans_as_it_was_shown_or_has_to_carry_nothing_stays(shown: bool):
+    goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, 0.0, on="bowl" if shown else "")
     start = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, -0.2)
     start.poses["bowl"] = leaning("bowl", start.poses["bowl"], 20)
+    if shown:
+        goal.poses["bowl"] = start.poses["bowl"]
     assert [transfer.object for transfer in plan(goal, start).transfers] == ["cup"]
 
 
