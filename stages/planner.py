@@ -296,8 +296,8 @@ class Planner(Stage):
                 raise Impossible(_no_room(Blocked(step, (), handled.why_not()[0])))
 
     def _solve_with_room(self, problem: Problem, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
-        """Before a transfer that failed is tried again, what stands beside its object is moved away if it can be; one
-        that failed in other places, too, is made by way of a place aside."""
+        """Before a transfer that failed is tried again, what stands beside its object is moved out of the hand's way if
+        it can be; one that failed in other places, too, is made by way of a place aside."""
         scene = self._scene(task)
         beside = {
             (neighbour, item, destination)
@@ -309,8 +309,20 @@ class Planner(Stage):
         roomy = replace(problem, obstructions=problem.obstructions | beside)
         for one in (*([roomy] if beside else ()), *([problem] if detours else ())):
             with suppress(Impossible):
-                return self._solve(one, detours, task, taught, ctx)
+                plan = self._solve(one, detours, task, taught, ctx)
+                if one is problem or self._makes_room(plan, beside, scene):
+                    return plan
         return self._solve(problem, frozenset(), task, taught, ctx)
+
+    def _makes_room(self, plan: Plan, beside: Iterable[tuple[str, str, str]], scene: Scene) -> bool:
+        """Whether what first moves away from beside an object is then out of the way of the hand that picks that."""
+        T_table_base, moves = inverse(scene.T_base_table), {move.object: move for move in reversed(plan.transfers)}
+        for name, item, _ in beside:
+            stances = self._stances[scene.standing[name].stance.item.name]
+            place = Standing.at(name, stances, T_table_base @ moves[name].T_base_targets[0])
+            if name in neighbours(item, scene.after(name, place, moves[name].destination)):
+                return False
+        return True
 
     def _solve(self, problem: Problem, detours: frozenset[str], task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """Searches, finds poses, and searches again with what was in the way, until every transfer has poses; what has

@@ -437,6 +437,17 @@ def test_what_others_belong_beside_goes_to_where_it_was_shown_if_they_have_no_ro
     assert reached(goal, after) and penetrations(after) == []
 
 
+def test_what_cannot_get_out_of_the_way_is_not_moved_before_a_transfer_is_tried_again():
+    """The mug is to stand beside the tray, and wherever it may the bowl that failed is right beside it."""
+    goal = Layout().put("tray", 0.161, 0.048, yaw=-1.91).put("mug", -0.096, -0.136, yaw=-3.05)
+    goal = goal.put("bowl", -0.198, -0.01, yaw=2.41)
+    start = Layout().put("tray", -0.266, 0.003, yaw=0.71).put("mug", 0.05, 0.034, yaw=-0.43)
+    start = start.put("bowl", 0.224, 0.065, yaw=1.66).put("soup_can", -0.09, -0.089)
+    found = plan(goal, start, avoid=("bowl: table -> table",))
+    assert [transfer.object for transfer in found.transfers] == ["bowl"]
+    assert reached(goal, executed(start, found))
+
+
 def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere():
     """A tower turned over: its lowest box belongs right beside the sponge that goes onto it next."""
     goal = Layout().put("sugar_box", 0.05, 0.09, yaw=0.3).put("sponge", 0, 0, on="sugar_box")
