@@ -315,9 +315,11 @@ class Planner(Stage):
         return self._solve(problem, frozenset(), task, taught, ctx)
 
     def _makes_room(self, plan: Plan, beside: Iterable[tuple[str, str, str]], scene: Scene) -> bool:
-        """Whether what first moves away from beside an object is then out of the way of the hand that picks that."""
+        """Whether what moves away from beside objects is then out of the way of the hand that picks them."""
         T_table_base, moves = inverse(scene.T_base_table), {move.object: move for move in reversed(plan.transfers)}
         for name, item, _ in beside:
+            if not moves.keys() >= {name, item}:
+                return False
             stances = self._stances[scene.standing[name].stance.item.name]
             place = Standing.at(name, stances, T_table_base @ moves[name].T_base_targets[0])
             if name in neighbours(item, scene.after(name, place, moves[name].destination)):

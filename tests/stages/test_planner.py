@@ -448,6 +448,13 @@ def test_what_cannot_get_out_of_the_way_is_not_moved_before_a_transfer_is_tried_
     assert reached(goal, executed(start, found))
 
 
+def test_a_transfer_that_failed_and_is_not_needed_any_more_asks_for_no_room():
+    goal, start = (Layout().put("tray", 0.1, 0.2).put("mug", 0.1, -0.3).put("bowl", 0.0, -0.3) for _ in range(2))
+    goal, start = goal.put("soup_can", -0.2, -0.1), start.put("soup_can", 0, 0, on="tray")
+    found = plan(goal, start, avoid=("bowl: table -> table",))
+    assert [transfer.object for transfer in found.transfers] == ["soup_can"]
+
+
 def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere():
     """A tower turned over: its lowest box belongs right beside the sponge that goes onto it next."""
     goal = Layout().put("sugar_box", 0.05, 0.09, yaw=0.3).put("sponge", 0, 0, on="sugar_box")
