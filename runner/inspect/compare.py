@@ -69,11 +69,13 @@ def envelope_differences(
     recorded: Envelope, replayed: Envelope, header: Iterable[str], kind: type[Message] | None = None
 ) -> Differences:
     """Every difference of two messages, those of ``header`` first; their fields are those of ``kind`` if it can read
-    both, else those that are there."""
+    both, else those that are there. Where only the bytes of the body differ, that is the one difference."""
     for name in header:
         yield from differences(getattr(recorded, name), getattr(replayed, name), name)
     if bytes(recorded.body) != bytes(replayed.body):
-        yield from _body_differences(recorded, replayed, kind)
+        found = list(_body_differences(recorded, replayed, kind))
+        before, now = (f"{memoryview(one.body).nbytes} bytes" for one in (recorded, replayed))
+        yield from found or [Difference("body", before, now, "the same values in other bytes")]
 
 
 def _body_differences(recorded: Envelope, replayed: Envelope, kind: type[Message] | None) -> Differences:

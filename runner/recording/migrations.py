@@ -10,9 +10,9 @@ from typing import Any
 
 import msgspec
 
-from runner.contract import Fields, Migration, Migrations
+from runner.contract import Fields, Message, Migration, Migrations
 from runner.graph.references import load_migrations, modules_of
-from runner.message.codec import Envelope
+from runner.message.codec import Envelope, decode
 
 UNNAMED = "MIGRATIONS"
 """The tables of a graph that names none."""
@@ -49,12 +49,14 @@ def _next(fields: Fields, migration: Migration) -> Fields:
     return migration.change(fields) if migration.change else fields
 
 
-def without_gained_fields(recorded: Envelope, replayed: Envelope) -> Envelope:
-    """A replayed message without the fields that its class has gained since: of those the recording says nothing."""
+def without_gained_fields(recorded: Envelope, replayed: Envelope, kind: type[Message]) -> Envelope:
+    """A replayed message without the fields that its class, ``kind``, and the structs inside have gained since: of
+    those the recording says nothing."""
     if recorded.type != replayed.type:
         return replayed
     old, new = msgspec.msgpack.decode(recorded.body), msgspec.msgpack.decode(replayed.body)
-    return msgspec.structs.replace(replayed, body=msgspec.Raw(msgspec.msgpack.encode(_shared(old, new))))
+    shared = _shared(old, new, decode(kind, replayed.body))
+    return msgspec.structs.replace(replayed, body=msgspec.Raw(msgspec.msgpack.encode(shared)))
 
 
 def _edited(value: Any, path: list[str], name: str | None) -> Any:
@@ -68,10 +70,16 @@ def _edited(value: Any, path: list[str], name: str | None) -> Any:
     return {name if key == path[0] else key: inner for key, inner in value.items() if key != path[0] or name}
 
 
-def _shared(old: Any, new: Any) -> Any:
-    """What is new, as far as it has the fields of what is old, and in their order."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        return {key: _shared(inner, new[key]) for key, inner in old.items() if key in new}
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        return [_shared(*pair) for pair in zip(old, new, strict=True)]
-    return new
+def _shared(old: Any, new: Any, value: Any) -> Any:
+    """What is new, of structs the fields that what is old has, in their order. ``value`` is what is new with its types:
+    they tell structs from dicts."""
+    match value, old, new:
+        case msgspec.Struct(), dict(), dict():
+            return {key: _shared(old[key], new[key], getattr(value, key, None)) for key in old if key in new}
+        case dict(), dict(), dict():
+            pairs = zip(new.items(), value.values(), strict=True)
+            return {key: _shared(old.get(key), inner, typed) for (key, inner), typed in pairs}
+        case list() | tuple(), list(), list() if len(old) == len(new):
+            return [_shared(*three) for three in zip(old, new, value, strict=True)]
+        case _:
+            return new

@@ -25,7 +25,7 @@ from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
 from runner.message.packet import Process
 from runner.process.step import arguments_of
-from runner.recording.recording import Recording, kind_of, opened, replicated
+from runner.recording.recording import Recording, opened, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
 from runner.replay.tasks import HEADER, Execution, Reexecution, Task, process_of, steps_of, what_differs
@@ -155,10 +155,12 @@ class Traveller:
             yield done.refused or f"the handler raised {done.error}"
         if sealed is None:
             yield "recorded, and not emitted in the replay"
-        elif (other := what_differs(recorded, sealed)) is None:
+            return
+        one = MessageId.of(sealed.id)
+        kind = self._graph.outputs_of(one.stage)[one.port]
+        if (other := what_differs(recorded, sealed, kind)) is None:
             yield "executed again: identical to the recording"
         else:
-            kind = kind_of(self._graph, recorded.id)
             found = [str(difference) for difference in envelope_differences(recorded, other, HEADER, kind)]
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]

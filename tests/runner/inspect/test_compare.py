@@ -1,7 +1,9 @@
+import msgspec
 import numpy as np
 import pytest
 
-from runner.inspect.compare import differences
+from runner.inspect.compare import differences, envelope_differences
+from runner.message.codec import Envelope, pack, unpack
 from tests.runner.common.toys import Answer
 
 
@@ -49,3 +51,13 @@ def test_finds_a_changed_element_of_an_empty_shape_and_of_integers():
     (found,) = differences(np.zeros((2, 2), np.uint8), np.array([[0, 0], [255, 0]], np.uint8))
     assert found.field == "[1, 0]"
     assert "255" in found.extent
+
+
+def test_the_same_values_in_other_bytes_are_a_difference():
+    one, other = (
+        Envelope("a.b#0", "a.b#0", 0, "B", 1, (), msgspec.Raw(msgspec.msgpack.encode({"tags": tags})))
+        for tags in ({"a": 1, "b": 2}, {"b": 2, "a": 1})
+    )
+    (found,) = envelope_differences(one, unpack(Envelope, pack(other)), ("id",))
+    assert str(found) == "body: recorded 13 bytes, replayed 13 bytes (the same values in other bytes)"
+    assert list(envelope_differences(one, unpack(Envelope, pack(one)), ("id",))) == []

@@ -3,12 +3,13 @@
 import json
 import re
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import numpy as np
 import pytest
 
-from runner.contract import Migration, Refused, name_of
+from runner.contract import Message, Migration, Refused, Struct, name_of
 from runner.graph.ports import port_name
 from runner.message.codec import CodecError, Envelope, decode_untyped, json_schema, open_envelope
 from runner.message.codec import envelope as envelope_of
@@ -112,9 +113,34 @@ def test_what_nothing_became_of_keeps_its_bytes():
     assert migrated(sealed, MIGRATIONS) is sealed
 
 
+class Inner(Struct, frozen=True, kw_only=True):
+    y: int = 0
+    w: int = 0
+
+
+class Today(Message, frozen=True, kw_only=True):
+    """What has gained ``z``, and inside ``w``."""
+
+    z: int = 0
+    x: int = 0
+    inner: tuple[Inner, ...] = ()
+    tags: dict[str, Inner] = msgspec.field(default_factory=dict[str, Inner])
+
+
 def test_gained_fields_are_not_compared_and_lost_ones_are():
-    old = envelope("A", 1, x=1, inner=[{"y": 2}])
-    new = without_gained_fields(old, envelope("A", 1, z=0, inner=[{"y": 2, "w": 5}], x=1))
+    old = envelope("Today", 1, x=1, inner=[{"y": 2}])
+    new = without_gained_fields(old, envelope("Today", 1, z=0, inner=[{"y": 2, "w": 5}], x=1), Today)
     assert bytes(new.body) == bytes(old.body)
-    lost = without_gained_fields(old, envelope("A", 1, x=1, inner=[{}]))
+    lost = without_gained_fields(old, envelope("Today", 1, x=1, inner=[{}]), Today)
     assert decode_untyped(lost.body) == {"x": 1, "inner": [{}]}
+
+
+@pytest.mark.parametrize(
+    "tags", [{"a": {"y": 1, "w": 0}, "b": {"y": 2}, "extra": {"y": 9}}, {"b": {"y": 2}, "a": {"y": 1}}, {"a": {"y": 1}}]
+)
+def test_keys_of_a_dict_are_no_fields(tags: dict[str, object]):
+    old = envelope("Today", 1, tags={"a": {"y": 1}, "b": {"y": 2}})
+    new = without_gained_fields(old, envelope("Today", 1, z=0, tags=tags), Today)
+    kept = {key: {"y": inner["y"]} for key, inner in cast("dict[str, dict[str, int]]", tags).items()}
+    assert bytes(new.body) == bytes(envelope("Today", 1, tags=kept).body)
+    assert bytes(new.body) != bytes(old.body)
