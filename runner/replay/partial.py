@@ -224,7 +224,7 @@ class PartialReplay:
             self._deliver(sealed)
 
     def _deliver(self, sealed: Envelope) -> None:
-        id, recorded = MessageId.of(sealed.id), sealed.id in self.frozen.released
+        id, recorded = MessageId.of(sealed.id), sealed.id in self._recording.messages
         for route in self._graph.routes(id.stage):
             stage = self._stages.get(route.consumer)
             if route.output != id.port or stage is None:

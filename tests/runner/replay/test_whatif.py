@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from runner.cli.main import main
-from runner.contract import Message
+from runner.contract import Message, Stage
 from runner.graph.reading import load_graph
-from runner.message.codec import decode
+from runner.message.codec import Envelope, Step, decode
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
+from tests.runner.common import toys as toy_stages
 from tests.runner.common.recordings import ToyRun, record, record_toys
 from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Total
 from tests.runner.replay.test_replay import replay
@@ -24,6 +25,27 @@ stages:
   counter: {stage: tests.runner.common.toys:Counter}
   doubler: {stage: tests.runner.common.toys:Doubler, inputs: {number: counter.number}}
 """
+
+LATEST = f"""
+name: latest
+stages:
+  counter: {{stage: tests.runner.common.toys:Counter}}
+  doubler: {{stage: tests.runner.common.toys:Doubler, inputs: {{number: counter.number}}}}
+  teller: {{stage: "{__name__}:Teller", inputs: {{double: {{from: doubler.double, policy: latest}}}}}}
+"""
+
+
+class Told(Message, frozen=True):
+    """What a teller says."""
+
+    text: str
+
+
+class Teller(Stage):
+    """Says doubles in words."""
+
+    def on_double(self, double: toy_stages.Double) -> Told:
+        return Told(text=f"{double.value}")
 
 
 class Louder(Gatherer):
@@ -107,6 +129,24 @@ def test_without_a_change_nothing_changes_however_many_work(toys: Path, workers:
     assert "executed again: splitter, worker, gatherer; as recorded: counter, sink, watcher" in said
     assert row(said, "worker/answer") == ["20", "-", "-", "-"]
     assert said.splitlines()[-1] == "NOTHING CHANGES: 45 identical, of 3 stages"
+
+
+class Hasty(ToyRun):
+    """Two doubles of five are replaced before their consumer has time."""
+
+    def _delivered(self, sealed: Envelope) -> Iterator[Envelope | Step]:
+        return iter(()) if sealed.id in ("doubler.double#1", "doubler.double#2") else super()._delivered(sealed)
+
+
+def test_what_was_replaced_by_newer_ones_stays_so_between_stages_that_are_executed(tmp_path: Path):
+    file = tmp_path / "latest.yaml"
+    file.write_text(LATEST)
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "latest.mcap", Hasty(graph, tmp_path).records())
+    code, said = replay(path, "--from", "doubler")
+    assert code == 0, said
+    assert "executed again: doubler, teller; as recorded: counter" in said
+    assert said.splitlines()[-1] == "NOTHING CHANGES: 8 identical, of 2 stages"
 
 
 def test_fewer_parts_gather_to_other_totals(toys: Path):
