@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -31,7 +31,8 @@ AHEAD = 16
 END = b""
 """A request that is the last: the stage is closed."""
 Key = tuple[str, str, str, int]
-"""A step by what it is, whatever it consumes: stage, handler, lineage, and how many such steps come before it."""
+"""A step by what it is, whatever it consumes: stage, handler, lineage, and how many such steps come before it; of those
+that come in any order, the sequence of what drives it."""
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -84,6 +85,8 @@ class _Stage:
     inbox: Inbox
     expected: deque[Key]
     """The recorded steps that are still to come, in order."""
+    unordered: Mapping[tuple[str, str], str]
+    """The ports that drive steps which come in any order, by stage and handler."""
     idle: list[Worker] = field(default_factory=list[Worker])
     ready: dict[Key, Ready] = field(default_factory=dict[Key, Ready])
     counts: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
@@ -93,7 +96,9 @@ class _Stage:
         """Takes a step that can run."""
         lineage = ready.arrivals[0].envelope.lineage if ready.arrivals else ""
         place = (ready.handler.name, lineage)
-        self.ready[self.node.name, *place, self.counts[place]] = ready
+        consumed = ((arrival.port.name, arrival.envelope.id) for arrival in ready.arrivals)
+        driven = _sequence(consumed, self.unordered.get((self.node.name, ready.handler.name)))
+        self.ready[self.node.name, *place, self.counts[place] if driven is None else driven] = ready
         self.counts[place] += 1
 
     def permitted(self) -> Key | None:
@@ -123,7 +128,8 @@ class PartialReplay:
         self._recording = recording
         self._graph = graph
         self._workers = workers
-        self._ranks, self._times = _journal(recording)
+        self._unordered = _unordered(recording, graph)
+        self._ranks, self._times = _journal(recording, self._unordered)
         self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
         self.frozen = Frozen(recording, names)
         self._ahead = 0
@@ -154,7 +160,7 @@ class PartialReplay:
         files = folder / node.name
         files.mkdir()
         node.prepare()
-        stage = _Stage(node, Inbox(node), deque(self._expected(node)))
+        stage = _Stage(node, Inbox(node), deque(self._expected(node)), self._unordered)
         for _ in range(self._workers if node.replicated else 1):
             log = folder / f"{node.name}-{len(self._processes)}.txt"
             stage.idle.append(Worker(lambda connection: serve(node, self._graph.seed, files, connection), log))
@@ -288,7 +294,24 @@ class Frozen:
         return sorted((id for ids in self._waiting.values() for id in ids), key=self._positions.__getitem__)
 
 
-def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
+def _unordered(recording: Recording, graph: Graph) -> dict[tuple[str, str], str]:
+    """The ports that drive steps which come in any order, by stage and handler: what replicas emit, one at a time."""
+    replicas = replicated(recording.graph) | {name for name, node in graph.nodes.items() if node.replicated}
+    return {
+        (node.name, handler.name): port.name
+        for node in graph.nodes.values()
+        for handler in node.type.handlers
+        if (port := handler.driver) is not None and port.kind == "one"
+        if port.name in node.inputs and node.inputs[port.name].stage in replicas
+    }
+
+
+def _sequence(consumed: Iterable[tuple[str, str]], port: str | None) -> int | None:
+    """Of the message that a step consumed on a port; None where there is none."""
+    return next((MessageId.of(id).sequence for name, id in consumed if name == port), None)
+
+
+def _journal(recording: Recording, unordered: Mapping[tuple[str, str], str]) -> tuple[dict[Key, int], dict[Key, int]]:
     """The order and the logical time of every step that was done."""
     done = [step for step in recording.steps if step.outcome == "done" and step.handler != "source"]
     done.sort(key=lambda step: step.incarnation)  # stable: within a process the journal has them in order
@@ -298,7 +321,9 @@ def _journal(recording: Recording) -> tuple[dict[Key, int], dict[Key, int]]:
     for step in done:
         known = (recording.messages[id].lineage for _, id in step.consumed if id in recording.messages)
         place = (step.stage, step.handler, next(known, ""))
-        key = (*place, counts[place])
+        driven = _sequence(step.consumed, unordered.get((step.stage, step.handler)))
+        key = (*place, counts[place] if driven is None else driven)
         counts[place] += 1
-        ranks[key], times[key] = len(ranks), step.time_ns
+        ranks.setdefault(key, len(ranks))  # each replica takes a step for what they do not share
+        times.setdefault(key, step.time_ns)
     return ranks, times

@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from runner.cli.main import main
-from runner.contract import Message, Stage
+from runner.contract import Context, Message, Stage
 from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, Step, decode
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
 from tests.runner.common import toys as toy_stages
 from tests.runner.common.recordings import ToyRun, record, record_toys
-from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Total
+from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Piece, Total, Worker
 from tests.runner.replay.test_replay import replay
 
 DOUBLES = """
@@ -35,6 +36,16 @@ stages:
 """
 
 
+DIARY = f"""
+name: diary
+stages:
+  counter: {{stage: tests.runner.common.toys:Counter, config: {{count: 2}}}}
+  splitter: {{stage: tests.runner.common.toys:Splitter, inputs: {{number: counter.number}}}}
+  worker: {{stage: "{__name__}:Uneven", replicas: 2, inputs: {{piece: splitter.piece, number: counter.number}}}}
+  diary: {{stage: "{__name__}:Diary", inputs: {{answer: worker.answer}}}}
+"""
+
+
 class Told(Message, frozen=True):
     """What a teller says."""
 
@@ -46,6 +57,27 @@ class Teller(Stage):
 
     def on_double(self, double: toy_stages.Double) -> Told:
         return Told(text=f"{double.value}")
+
+
+class Uneven(Worker):
+    """Needs longest for the first part, so that the others overtake it."""
+
+    def on_piece(self, piece: Piece, number: Number, ctx: Context) -> Answer:
+        time.sleep(0.3 * (piece.index == 0))
+        return super().on_piece(piece, number, ctx)
+
+
+class Diary(Stage):
+    """Says in which order answers came."""
+
+    stateful = True
+
+    def __init__(self):
+        self._seen: list[int] = []
+
+    def on_answer(self, answer: Answer) -> Told:
+        self._seen.append(answer.index)
+        return Told(text=str(self._seen))
 
 
 class Louder(Gatherer):
@@ -129,6 +161,16 @@ def test_without_a_change_nothing_changes_however_many_work(toys: Path, workers:
     assert "executed again: splitter, worker, gatherer; as recorded: counter, sink, watcher" in said
     assert row(said, "worker/answer") == ["20", "-", "-", "-"]
     assert said.splitlines()[-1] == "NOTHING CHANGES: 45 identical, of 3 stages"
+
+
+def test_parts_that_overtake_each_other_are_taken_one_by_one_as_recorded(tmp_path: Path):
+    file = tmp_path / "diary.yaml"
+    file.write_text(DIARY)
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "diary.mcap", ToyRun(graph, tmp_path).records())
+    code, said = replay(path, "--from", "splitter", "--workers", "2")
+    assert code == 0, said
+    assert said.splitlines()[-1] == "NOTHING CHANGES: 24 identical, of 3 stages"
 
 
 class Hasty(ToyRun):
