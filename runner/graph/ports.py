@@ -2,10 +2,12 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
 
 from runner.contract import Command, Context, Message, Part, Refused, Stage, name_of
 
@@ -84,6 +86,8 @@ def inspect_stage(cls: type[Stage]) -> StageType:
     methods = [handler.name for handler in handlers] + (["source"] if source else [])
     emitted = [kind for name in methods for kind in _message_types(_hints(cls, name)["return"])]
     refuse_shared(cls.__name__, ((port_name(kind), f"{kind.__module__}:{kind.__qualname__}") for kind in emitted))
+    for kind in (*emitted, *(port.type for handler in handlers for port in handler.inputs)):
+        _refuse_sets(f"{cls.__name__}: {kind.__name__}", kind, set())
     outputs = {port_name(kind): kind for kind in emitted}
     return StageType(cls, handlers, source, outputs, _config_type(cls))
 
@@ -122,15 +126,20 @@ def _handler(cls: type[Stage], name: str) -> Handler:
 def _hints(cls: type[Stage], name: str) -> dict[str, Any]:
     """Resolved annotations of a method's parameters, in their order, and of its result; each must have one."""
     method: Callable[..., Any] = getattr(cls, name)
-    try:
-        hints = get_type_hints(method)
-    except NameError as error:
-        raise Refused(f"{cls.__name__}.{name}: an annotation cannot be resolved: {error}") from None
+    hints = _resolved(f"{cls.__name__}.{name}", method)
     parameters = (*list(inspect.signature(method).parameters)[1:], "return")
     for parameter in parameters:
         if parameter not in hints:
             raise Refused(f"{cls.__name__}.{name}({parameter}): has no annotation")
     return {parameter: hints[parameter] for parameter in parameters}
+
+
+def _resolved(place: str, what: Callable[..., Any]) -> dict[str, Any]:
+    """The annotations of a method or class."""
+    try:
+        return get_type_hints(what)
+    except NameError as error:
+        raise Refused(f"{place}: an annotation cannot be resolved: {error}") from None
 
 
 def _input_port(cls: type[Stage], method: str, parameter: str, annotation: Any) -> InputPort:
@@ -157,6 +166,20 @@ def _refuse_inputs(cls: type[Stage], method: str, inputs: list[InputPort]) -> No
     for port in inputs:  # nothing else hangs on a command: a join with one would wait for ever
         if issubclass(port.type, Command) and len(inputs) > 1:
             raise Refused(f"{cls.__name__}.{method}({port.name}): a command is the only message its handler takes")
+
+
+def _refuse_sets(place: str, annotation: Any, known: set[Any]) -> None:
+    """Refuses sets in a type: their order is another in each process, and with it the bytes."""
+    kind = get_origin(annotation) or annotation
+    if isinstance(kind, type) and issubclass(kind, Set):
+        raise Refused(f"{place}: a set has no order; valid: tuple")
+    if isinstance(kind, type) and (issubclass(kind, msgspec.Struct) or is_dataclass(kind)) and kind not in known:
+        known.add(kind)
+        for name, hint in _resolved(place, kind).items():
+            if get_origin(hint) is not ClassVar:
+                _refuse_sets(f"{place}.{name}", hint, known)
+    for argument in get_args(annotation):
+        _refuse_sets(place, argument, known)
 
 
 def _message_types(annotation: Any) -> Iterator[type[Message]]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from runner.contract import Context, Refused, Stage
+from runner.contract import Context, Message, Refused, Stage, Struct
 from runner.graph.ports import inspect_stage, port_name
 from tests.runner.common.toys import Account, Add, Answer, Collect, Double, Gatherer, Number, Piece, Total, Worker
 
@@ -99,9 +99,28 @@ class MutableConfig(Stage):
     def on_number(self, number: Number) -> None: ...
 
 
+class Tagged(Struct, frozen=True):
+    children: tuple["Tagged", ...] = ()
+    tags: tuple[dict[str, frozenset[str] | None], ...] = ()
+
+
+class Labels(Message, frozen=True):
+    labels: tuple[Tagged, ...] = ()
+
+
+class EmitsSet(Stage):
+    def on_number(self, number: Number) -> Labels | None: ...
+
+
+class TakesSet(Stage):
+    def on_labels(self, labels: Labels) -> None: ...
+
+
 @pytest.mark.parametrize(
     ("cls", "message"),
     [
+        (EmitsSet, "EmitsSet: Labels.labels.tags: a set has no order; valid: tuple"),
+        (TakesSet, "TakesSet: Labels.labels.tags: a set has no order; valid: tuple"),
         (NoAnnotation, r"NoAnnotation.on_number\(number\): has no annotation"),
         (NoResult, r"NoResult.on_number\(return\): has no annotation"),
         (WrongType, r"WrongType.on_number\(number\): .* is not a Message"),
