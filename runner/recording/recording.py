@@ -1,6 +1,7 @@
 """What a recording holds: messages by id, journalled steps, log lines, its origin, and whether it is complete."""
 
 import contextlib
+import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -74,6 +75,8 @@ class Completeness:
     """What else does not hold: the first few findings and how many more there are."""
     counts: Mapping[str, int] | None = field(default=None, compare=False)
     """Records that came, by topic; None where nobody counted them."""
+    run: str = field(default="", compare=False)
+    """:func:`hash_of` the metadata that says what ran where; empty where the recorder wrote none."""
 
     @property
     def word(self) -> str:
@@ -83,12 +86,18 @@ class Completeness:
     def metadata(self) -> dict[str, str]:
         """As it stands in a file."""
         counts = {} if self.counts is None else {"counts": json.dumps(self.counts)}
-        return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason, **counts}
+        run = {"run": self.run} if self.run else {}
+        return {"verdict": self.word, "missing": json.dumps(self.missing), "reason": self.reason, **counts, **run}
 
     def __str__(self) -> str:
         reasons = [self.reason] if self.reason else []
         reasons += [f"{len(self.missing)} missing: {listed(self.missing)}"] if self.missing else []
         return f"{self.word}: {'; '.join(reasons)}" if reasons else self.word
+
+
+def hash_of(run: Mapping[str, str]) -> str:
+    """SHA-256 of what a recording says of its run, whatever the order."""
+    return hashlib.sha256(json.dumps(run, sort_keys=True).encode()).hexdigest()
 
 
 def replicated(graph: Mapping[str, Any]) -> frozenset[str]:
@@ -182,9 +191,9 @@ class Recording:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
         counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
-        reason = self._breakage or written.get("reason", "")
+        reason, run = self._breakage or written.get("reason", ""), written.get("run", "")
         if self._steps_only:
-            return Completeness(False, (), reason, counts)
+            return Completeness(False, (), reason, counts, run)
         proof, found = self._prove(), ""
         missing = proof.missing()
         if self._says_ends:
@@ -192,7 +201,8 @@ class Recording:
             found = in_short(chain(proof.problems(counts), self._misplaced))
         complete = written.get("verdict") == "COMPLETE" and not (self._breakage or found or missing)
         reasons = (reason, "" if found in reason else found)
-        return Completeness(complete, missing, "; ".join(filter(None, reasons)), counts if self._says_ends else None)
+        known = counts if self._says_ends else None
+        return Completeness(complete, missing, "; ".join(filter(None, reasons)), known, run)
 
     def records(self) -> Iterator[Entry | Metadata]:
         """Everything in the file once more, as it was written; what cannot be read is left out."""
@@ -295,7 +305,10 @@ class Recording:
     def _breakage(self) -> str:
         if self.torn:
             return f"torn at {self.damage[-1]}"
-        return f"damaged at {self.damage[0]}" if self.damage else ""
+        if self.damage:
+            return f"damaged at {self.damage[0]}"
+        written = self.metadata.get(VERDICT, {}).get("run", "")
+        return f"metadata {RUN!r} is not what was written" if written not in ("", hash_of(self.run)) else ""
 
     @property
     def _says_ends(self) -> bool:

@@ -41,6 +41,7 @@ from runner.recording.recording import (
     STEPS_ONLY,
     VERDICT,
     Completeness,
+    hash_of,
     payload_kind,
 )
 
@@ -146,7 +147,9 @@ class RecordingWriter:
         own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
         vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
         self._writer.start(profile=PROFILE)
-        self._writer.add_metadata(RUN, run_metadata(manifest))
+        run = run_metadata(manifest)
+        self._run_hash = hash_of(run)
+        self._writer.add_metadata(RUN, run)
         self._writer.flush()
         self._container = Container(self._file, str(self._path))
         """Knows the channels that have been read back."""
@@ -296,7 +299,7 @@ class RecordingWriter:
 
     def _write_verdict(self) -> None:
         self._flush()
-        self._writer.add_metadata(VERDICT, self._verdict().metadata())
+        self._writer.add_metadata(VERDICT, replace(self._verdict(), run=self._run_hash).metadata())
         self._writer.finish()
         self._file.flush()
         self._prove(self._file.tell())

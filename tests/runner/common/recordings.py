@@ -16,7 +16,7 @@ from runner.message.codec import Envelope, LogLine, Lost, Step, pack
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Ready
 from runner.process.step import Executor, receive, step_time
-from runner.recording.recording import RUN, Completeness
+from runner.recording.recording import RUN, VERDICT, Completeness, hash_of
 from runner.recording.writer import Manifest, RecordingWriter, topic
 from tests.runner.common.runs import TOYS
 
@@ -127,7 +127,10 @@ def rewrite(
         reader, writer = make_reader(file), Writer(output)
         writer.start()
         metadata = {found.name: found.metadata for found in reader.iter_metadata()}
-        writer.add_metadata(RUN, {**metadata.pop(RUN), **(aspects or {})})
+        run = {**metadata.pop(RUN), **(aspects or {})}
+        writer.add_metadata(RUN, run)
+        if "run" in metadata.get(VERDICT, {}):
+            metadata[VERDICT]["run"] = hash_of(run)
         channels: dict[str, int] = {}
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if channel.topic not in channels:

@@ -30,6 +30,7 @@ LOST_NS = 500_000_000
 """A kill costs no more than this."""
 ATTEMPTS = 3
 """A machine that is busy elsewhere may give the recorder no time before it is killed: then the kill is tried again."""
+OLD = Path(__file__).parents[1] / "weather-1.mcap"
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,22 @@ def test_a_torn_recording_becomes_a_clean_one_that_says_so(toys: Path, tmp_path:
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert summary.chunk_indexes
+
+
+def test_a_run_that_is_damaged_is_said_so_also_when_it_is_recovered(toys: Path, tmp_path: Path):
+    content, damaged = bytearray(toys.read_bytes()), tmp_path / "damaged.mcap"
+    content[content.index(b'"numpy": "') + len(b'"numpy": "')] ^= 1
+    damaged.write_bytes(content)
+    _, target = recover(damaged, tmp_path / "clean.mcap")
+    for path in (damaged, target):
+        assert str(Recording(path).verdict) == "INCOMPLETE: metadata 'run' is not what was written"
+
+
+def test_a_recording_whose_verdict_says_nothing_of_the_run_is_complete(tmp_path: Path):
+    _, target = recover(OLD, tmp_path / "copy.mcap")
+    for path in (OLD, target):
+        assert "run" not in Recording(path).metadata["verdict"]
+        assert Recording(path).verdict.complete
 
 
 def test_what_the_journal_names_beyond_the_tear_is_missing(toys: Path, tmp_path: Path):
