@@ -7,15 +7,16 @@ import importlib
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from runner.contract import Message, Refused, Stage
+from runner.contract import Refused, Stage
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.inspect.causes import Causes
 from runner.inspect.compare import clipped, envelope_differences
@@ -85,6 +86,20 @@ def first_match(recording: Recording, graph: Graph, condition: str) -> str | Non
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class _Stop:
+    """A message that was reached."""
+
+    sealed: Envelope
+    """As it was executed; as recorded where it was not."""
+    step: Step | None
+    """Of which it is."""
+    names: dict[str, Any]
+    """What there is to look at."""
+    notes: list[str]
+    """What came of it."""
+
+
 class Traveller:
     """Goes from message to message; stages are constructed when the first of their messages is reached."""
 
@@ -100,31 +115,29 @@ class Traveller:
         """Shows a message, with ``step`` the ones after it too for as long as somebody presses Enter."""
         ids = list(self._recording.messages)
         for id in ids[ids.index(start) :]:
-            names, notes = self._reach(id)
-            print("\n".join(self._described(id, names["message"], notes)), flush=True)
+            stop = self._reach(id)
+            print("\n".join(self._described(stop)), flush=True)
             if prompt:
-                _prompt(names)
-            if not step or not _goes_on(names):
+                _prompt(stop.names)
+            if not step or not _goes_on(stop.names):
                 return
             prompt = False
 
-    def _reach(self, id: str) -> tuple[dict[str, Any], list[str]]:
-        """Executes the stage that emitted a message up to it: what there is to look at, and what came of it.
-
-        Of devices, which are not executed, there is no stage.
-        """
+    def _reach(self, id: str) -> _Stop:
+        """Executes the stage that emitted a message up to it. Of devices, which are not executed, there is no stage."""
         step, recorded = self._causes.step_of(id), self._recording.envelope(id)
         node = self._graph.nodes.get(MessageId.of(id).stage)
         names: dict[str, Any] = {"stage": None, "message": None, "arrivals": {}, "recording": self._recording}
         if node is None or node.type.cls.device or step is None:
             why = "taken from the recording: " + ("no step of it is journalled" if step is None else "a device")
-            return {**names, "message": opened(self._graph, recorded)}, [why]
+            return _Stop(recorded, step, {**names, "message": opened(self._graph, recorded)}, [why])
         names["stage"], executions = self._process_of(step)
         execution = next((done for done in executions if _reached(done, step, id)), Execution(step))
         names["arrivals"] = arguments_of(execution.arrivals)
         sealed = next((sealed for sealed in execution.emitted if sealed.id == id), None)
         names["message"] = opened(self._graph, sealed) if sealed else None
-        return names, [*self._notes(execution, recorded, sealed), *self._log]
+        notes = [*self._notes(execution, step, recorded, sealed), *self._log]
+        return _Stop(sealed or recorded, execution.step, names, notes)
 
     def _process_of(self, step: Step) -> tuple[Stage, Iterator[Execution]]:
         """The process that took a step, as far as it has been executed again."""
@@ -150,7 +163,10 @@ class Traveller:
     def _hear(self, text: str, level: str) -> None:
         self._log.append(f"{level} of the stage: {text}")
 
-    def _notes(self, done: Execution, recorded: Envelope, sealed: Envelope | None) -> Iterator[str]:
+    def _notes(self, done: Execution, step: Step, recorded: Envelope, sealed: Envelope | None) -> Iterator[str]:
+        """What became of a message that was recorded as one of ``step``."""
+        if done.step is not step:
+            yield f"recorded in another: {_place(step)}"
         if done.refused or done.error:
             yield done.refused or f"the handler raised {done.error}"
         if sealed is None:
@@ -165,20 +181,25 @@ class Traveller:
             yield f"executed again: {len(found)} fields differ from the recording"
             yield from found[:DIFFERENCES]
 
-    def _described(self, id: str, message: Message | None, notes: Iterable[str]) -> Iterator[str]:
+    def _described(self, stop: _Stop) -> Iterator[str]:
         """A message, what became of it, and its causes, as lines."""
-        step, sealed = self._causes.step_of(id), self._recording.envelope(id)
-        yield f"{id}  {sealed.type}, of {sealed.lineage}"
+        id, step, message = stop.sealed.id, stop.step, stop.names["message"]
+        yield f"{id}  {stop.sealed.type}, of {stop.sealed.lineage}"
         if step is not None:
-            yield f"  step {step.number} of {process_of(step)}, {step.handler}"
-        yield from (f"  {note}" for note in notes)
+            yield f"  {_place(step)}"
+        yield from (f"  {note}" for note in stop.notes)
         fields = message.__struct_fields__ if message is not None else ()
         yield from (f"    {name} = {brief(getattr(message, name))}" for name in fields)
         if step is not None and step.consumed:
-            yield f"  causes (the whole tree: runner why {id} {self._recording.path})"
+            tree = f" (the whole tree: runner why {id} {self._recording.path})"
+            yield f"  causes{tree if step is self._causes.step_of(id) else ''}"
             known = self._recording.messages
             rows = [(port, id, known[id].type if id in known else "not recorded") for port, id in step.consumed]
             yield from (f"    {line}" for line in table(("port", "id", "type"), rows)[1:])
+
+
+def _place(step: Step) -> str:
+    return f"step {step.number} of {process_of(step)}, {step.handler}"
 
 
 def _prompt(names: dict[str, Any]) -> None:

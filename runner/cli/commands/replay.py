@@ -48,6 +48,11 @@ def _replay(options: argparse.Namespace) -> int:
         raise Refused("--verify goes through the whole recording; it does not stop with --until, --break or --step")
     if options.until and options.condition:
         raise Refused("--until and --break each say where to stop; give one")
+    if travels and options.origins:
+        raise Refused(
+            "--until, --break and --step execute only the stages of the messages they stop at; valid with them: --set "
+            "and --swap, not --from"
+        )
     if options.verify and changes:
         raise Refused("--verify compares the recording as it is; valid with --from or --swap: nothing else")
     from runner.process.forks import become_clean

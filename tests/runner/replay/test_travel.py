@@ -73,6 +73,17 @@ def test_a_changed_stage_is_stopped_at_the_same_message(toys: Path, typed: Typed
     assert "recorded, and not emitted in the replay" in said
 
 
+def test_a_message_of_another_step_is_shown_with_that_step(toys: Path, typed: Typed):
+    _, said = typed(toys, "--until", "splitter.piece#4", "--set", "splitter.parts=5")
+    lines = [line.strip() for line in said.splitlines()]
+    assert lines[:3] == [
+        "splitter.piece#4  Piece, of counter.number#0",
+        "step 0 of splitter[0], on_number",
+        "recorded in another: step 1 of splitter[0], on_number",
+    ]
+    assert lines[-2:] == ["causes", "number  counter.number#0  Number"]
+
+
 def test_breaks_where_a_condition_first_holds_and_opens_a_prompt_with_the_state(toys: Path, typed: Typed):
     condition = "counter.number.value == 3 and worker.answer.index == 1"
     show = "print(type(stage).__name__, message.index)\nexit()\n"
@@ -115,6 +126,7 @@ def test_without_messages_there_is_none_to_stop_at(tmp_path: Path, typed: Typed,
         (["--break", "gatherer.total.lst"], "Total has no field 'lst'; did you mean 'last'? valid: last, samples"),
         (["--break", "gatherer.total.last >"], "is no expression of Python: invalid syntax"),
         (["--until", "a.b#1", "--break", "x"], "--until and --break each say where to stop; give one"),
+        (["--until", "gatherer.total#1", "--from", "nonsense"], "valid with them: --set and --swap, not --from"),
         (["--until", "a.b#1", "--verify"], "--verify goes through the whole recording"),
     ],
 )
