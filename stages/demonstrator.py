@@ -291,6 +291,10 @@ class Demonstrator(Stage):
         if not self._state.goal_name:
             self._state = replace(self._state, phase=Phase.IDLE)
             return
+        if observation.unusable:
+            self._state = replace(self._state, looks=self._state.looks + 1)
+            yield self._look_again("perception", observation.unusable, ctx, blind=True)
+            return
         yield from self._consider(scene_graph, observation, ctx)
 
     def _answered(
@@ -500,11 +504,12 @@ class Demonstrator(Stage):
         where = f", from view {state.views[0]}" if state.views[0] else ""
         return LookRequest(purpose=state.purpose + again + where, view=state.views[0])
 
-    def _look_again(self, stage: str, why: str, ctx: Context) -> LookRequest | Task | Verdict:
-        """One more look at the same scene (its noise is new), or the verdict once these are used up."""
+    def _look_again(self, stage: str, why: str, ctx: Context, *, blind: bool = False) -> LookRequest | Task | Verdict:
+        """One more look at the same scene (its noise is new), or the verdict once these are used up; ``blind`` if the
+        last one showed nothing, by which the rest could be restored."""
         if not self._may_see_more():
             why = f"{why} ({self._state.repeats + 1} looks at scene '{self._state.purpose}')"
-            missing = stage == "perception" and self._state.goal is not None
+            missing = stage == "perception" and self._state.goal is not None and not blind
             return self._do_without(why, ctx) if missing else self._fail(stage, why, ctx)
         self._state = replace(self._state, repeats=self._state.repeats + 1)
         ctx.log(f"{why}; looking again", level="warning")

@@ -117,8 +117,10 @@ def estimate_scene(
     hypotheses, filters, refiner, builder = _stages(path, n_objects, dof, device)
     # A ranker of its own: no name depends on an image before.
     estimator = SceneEstimator(hypotheses, filters, Ranker(Ranker.Config()), refiner, appraiser)
-    *_, final = estimator.messages(frame, candidates, Quiet())
-    assert isinstance(final, SceneEstimate)
+    observation, *_, final = estimator.messages(frame, candidates, Quiet())
+    assert isinstance(observation, Observation) and isinstance(final, SceneEstimate)
+    if observation.unusable:
+        raise Refused(observation.unusable)
     return EstimatedScene(final, builder.on_scene_estimate(final))
 
 

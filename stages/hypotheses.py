@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from runner.contract import Context, Refused, Stage
+from stages.geometry.poses import pose
 from stages.messages import Candidate, Candidates, Frame, Hypothesis, ObjectPose, Observation, Posterior
 from stages.messages.digest import Contender, DepthPatch, LoneCandidate, LoneEstimate, LonePose, Offer, Placed, Search
 from stages.perception.hypotheses.combinations import (
@@ -96,10 +97,15 @@ class Hypotheses(Stage):
     def on_candidates(
         self, frame: Frame, candidates: Candidates, ctx: Context
     ) -> Iterator[Observation | LoneCandidate]:
-        """One observation, then every candidate by itself, the most confident first."""
+        """One observation, then every candidate by itself, the most confident first; without a support plane none."""
         number = self._n_objects(frame)
-        yield preprocess(frame, candidates.candidates, ctx.rng, max_height=self.config.max_height)
         prospects = ordered(candidates.candidates) or [None]
+        try:
+            observation = preprocess(frame, candidates.candidates, ctx.rng, max_height=self.config.max_height)
+        except Refused as refusal:
+            ctx.log(f"{refusal}; nothing is estimated", level="warning")
+            observation, prospects = _unusable(frame, str(refusal)), [None]
+        yield observation
         for index, candidate in enumerate(prospects):
             yield LoneCandidate(index=index, count=len(prospects), candidate=candidate, n_objects=number)
 
@@ -203,6 +209,22 @@ class Hypotheses(Stage):
             f"{frame.name}: the number of objects is not known; set hypotheses.n_objects to a whole number or auto, or "
             "use a data set with a targets file"
         )
+
+
+def _unusable(frame: Frame, reason: str) -> Observation:
+    """An observation without a reading, of a plane 1 m ahead of the camera."""
+    return Observation(
+        depth=np.zeros(frame.depth.shape, np.float32),
+        rgb=frame.rgb,
+        foreground=np.zeros(frame.depth.shape, bool),
+        K=frame.K,
+        T_camera_table=pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0])),
+        T_base_camera=frame.T_base_camera,
+        scene_id=frame.scene_id,
+        image_id=frame.image_id,
+        name=frame.name,
+        unusable=reason,
+    )
 
 
 def _contender(posterior: Posterior) -> Contender:

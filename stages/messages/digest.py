@@ -39,6 +39,8 @@ class Observation(Message, frozen=True, kw_only=True):
     name: str = ""
     support: Matrix | None = None
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
+    unusable: str = ""
+    """Why nothing is to be seen in the frame, in words: then there is no reading, and the plane is no real one."""
 
 
 class ParticleTrace(Struct, frozen=True, kw_only=True):

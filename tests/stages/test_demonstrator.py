@@ -151,6 +151,30 @@ def test_shows_disturbs_and_restores_a_goal() -> None:
     assert (verdict.looks, verdict.plans, verdict.transfers) == (3, 1, 1)
 
 
+UNUSABLE = msgspec.structs.replace(BLIND, unusable="look 3: no support plane")
+"""What a look shows that somebody leans into; the scene graph that comes with it is empty."""
+NOTHING = without(GOAL, {item.name for item in GOAL.objects})
+
+
+def test_a_look_that_shows_nothing_is_taken_again_and_ends_in_a_verdict_if_all_do() -> None:
+    """What was known before stays, and nothing is done by it."""
+    episode = Episode(repeats=1)
+    episode.until_transfer()
+    episode.ended(1, STEP)
+    assert episode.seen(NOTHING, UNUSABLE) == [LookRequest(purpose="after transfer 1, look 2")]
+    verdict = the_verdict(episode.seen(GOAL))
+    assert verdict.success and verdict.looks == 4
+
+    episode = Episode(repeats=1)
+    episode.until_start(GOAL)
+    for _ in range(2):
+        messages = episode.seen(NOTHING, UNUSABLE)
+    verdict = the_verdict(messages)
+    assert (verdict.failed_stage, verdict.reason, verdict.transfers) == (
+        "perception", "look 3: no support plane (2 looks at scene 'start')", 0,
+    )  # fmt: skip
+
+
 def test_a_new_scene_is_looked_at_from_all_views_and_what_one_shows_is_there() -> None:
     episode = Episode(robot=BUILT_IN.with_name("ur5e_hand.yaml"))
     episode.take(episode.stage.on_start(episode.ctx))

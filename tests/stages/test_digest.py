@@ -32,8 +32,10 @@ from stages.messages import (
 from stages.messages.digest import Contender, LoneCandidate, LoneEstimate
 from stages.particle_filter import ParticleFilter
 from stages.ranker import Ranker
+from stages.refiner import Refiner
 from stages.results import BopResults
 from stages.scene.catalogue import Catalogue
+from stages.scene_graph import SceneGraphBuilder
 from tests.stages.episodes import Recorded
 from tests.stages.perception.scenes import CATALOGUE, CATALOGUE_FILE, DATA, VIEW, K, Rendered, render, upright
 
@@ -128,10 +130,21 @@ def test_the_number_of_objects_comes_from_the_frame_or_is_asked_for(seen: Render
         enumerate_(Hypotheses.Config(), frame(seen), both(seen))
 
 
-def test_an_image_without_depth_is_refused(seen: Rendered) -> None:
-    dark = msgspec.structs.replace(frame(seen), depth=np.zeros_like(seen.scene.depth))
-    with pytest.raises(Refused, match="scene: no support plane; the depth image has 0 readings"):
-        enumerate_(Hypotheses.Config(n_objects=1), dark, candidates())
+@pytest.mark.parametrize("up", [None, pose(np.eye(3), np.array([0.0, 0.0, 1.0]))])
+@pytest.mark.parametrize("n_objects", [1, "auto"])
+def test_an_image_without_depth_is_said_and_has_an_empty_estimate(
+    n_objects: int | Literal["auto"], up: np.ndarray | None, seen: Rendered, filter_stage: ParticleFilter
+) -> None:
+    dark = msgspec.structs.replace(frame(seen), depth=np.zeros_like(seen.scene.depth), T_base_camera=up)
+    config = Hypotheses.Config(n_objects=n_objects, suggestions=True)
+    (observation, *hypotheses), ctx = enumerate_(config, dark, both(seen), filter_stage)
+    assert "scene: no support plane" in observation.unusable and "the depth image has 0 readings" in ctx.lines[0]
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    refined = Refiner(Refiner.Config(catalogue=CATALOGUE_FILE)).on_scene_estimate(estimate, observation, ctx)
+    assert (refined.objects, refined.unknown, refined.image_id) == ((), (), 7)
+    assert (
+        SceneGraphBuilder(SceneGraphBuilder.Config(catalogue=CATALOGUE_FILE)).on_scene_estimate(refined).objects == ()
+    )
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,8 @@ def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
         estimate_scene(RGB, depth, K, CATALOGUE_FILE, boxes=[("teapot", (0, 0, 9, 9))])
     with pytest.raises(Refused, match=r"box of mug: .* is not x0, y0, x1, y1 with x0 < x1"):
         estimate_scene(RGB, depth, K, CATALOGUE_FILE, boxes=[("mug", (9, 9, 0, 0))])
+    with pytest.raises(Refused, match="image: no support plane; the depth image has 0 readings"):
+        estimate_scene(RGB, np.zeros_like(depth), K, CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match="no such catalogue"):
         estimate_scene(RGB, depth, K, tmp_path / "none.yaml", boxes=given)
 
