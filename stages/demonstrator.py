@@ -58,7 +58,7 @@ from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
 from stages.scene.naming import exchanges
-from stages.scene.relations import Tolerances, gaps
+from stages.scene.relations import Tolerances, gaps, is_covered
 from stages.scene.stance import TIPPED, Stances, is_tipped, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
@@ -627,10 +627,29 @@ class Demonstrator(Stage):
         if hidden := state.unproved.intersection(state.remembered):
             why = f"let go of, neither felt to stand nor seen since: {', '.join(sorted(hidden))}"
             return self._look_again("perception", why, ctx)
+        if covered := self._covered(goal):
+            why = f"something unknown stands on {', '.join(covered)}, which the goal wants clear"
+            return self._look_again("perception", why, ctx)
         if unsure := _doubtful_parents(goal):
             why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
             return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
         return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
+
+    def _covered(self, goal: SceneGraph) -> list[str]:
+        """What is seen, clear in the goal and has something on it that no object explains, unless it had when the goal
+        was taught."""
+        scene = self._state.scene
+        assert scene is not None
+        clear = {item.arguments[0] for item in goal.assertions if item.predicate == "clear"}
+        now, then = (
+            {
+                item.name
+                for item in standing_of(one.objects, self._stances, one.T_base_table)
+                if item.name in clear and is_covered(item, one.unknown, Tolerances())
+            }
+            for one in (scene, goal)
+        )
+        return sorted(now - then - {*self._state.remembered})
 
     def _check_transfer(self, scene: SceneGraph, violated: Sequence[Assertion], ctx: Context) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan.
@@ -719,6 +738,9 @@ class Demonstrator(Stage):
         goal = state.whole or state.goal
         if goal is not None and state.scene is not None:
             held, violated = satisfied(goal, state.scene, self._catalogue)
+            covered = {Assertion(predicate="clear", arguments=(name,)) for name in self._covered(goal)}
+            violated = (*violated, *(item for item in held if item in covered))
+            held = tuple(item for item in held if item not in covered)
         if state.lacking and state.lacking not in reason:
             reason = f"{reason}; {state.lacking}"
         if fallen := self._fallen():

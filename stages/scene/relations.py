@@ -21,11 +21,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from stages.geometry import regions
-from stages.messages.scene import Assertion
+from stages.messages.scene import Assertion, UnknownRegion
 from stages.scene.stance import Standing
 
 TABLE = "table"
+_INWARDS = 0.01
+"""Metres from the edge of a surface within which the middle of something may be beside it."""
+_HIDDEN = 0.05
+"""Metres above a surface at which what shows of something that stands on it begins at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +81,22 @@ def gaps(standing: Sequence[Standing], found: Sequence[Assertion], tolerances: T
     carriers = {item.arguments[0]: item.arguments[1] for item in found if item.predicate in ("on", "in")}
     above = {item.name: item.z_bottom - _surface(named.get(carriers[item.name]), item) for item in standing}
     return {name: gap for name, gap in above.items() if gap > tolerances.contact}
+
+
+def is_covered(item: Standing, unknown: Sequence[UnknownRegion], tolerances: Tolerances) -> bool:
+    """Whether something that no object explains stands on an object, or in its hollow and out of it.
+
+    Its middle is over the surface; what shows of it begins no deeper than a contact may, rises clearly above the
+    surface, and above the rim: what is lower in a hollow may be the object's own wall, estimated a little off.
+    """
+    for one in unknown:
+        bottom, top = one.centre_table[2] + np.array([-0.5, 0.5]) * one.extent_table[2]
+        for surface, z in ((item.top, item.z_top), (item.floor, item.z_floor)):
+            over = regions.inside(one.centre_table[None, :2], surface, margin=_INWARDS)
+            begins = -tolerances.contact < bottom - z < _HIDDEN
+            if over and begins and top > max(z + tolerances.contact, item.z_top + tolerances.lift):
+                return True
+    return False
 
 
 def _surface(carrier: Standing | None, item: Standing) -> float:

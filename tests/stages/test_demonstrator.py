@@ -151,6 +151,39 @@ def test_shows_disturbs_and_restores_a_goal() -> None:
     assert (verdict.looks, verdict.plans, verdict.transfers) == (3, 1, 1)
 
 
+def test_what_nobody_recognised_on_what_the_goal_wants_clear_is_no_success() -> None:
+    layout = Layout().put("tea_box", 0.0, 0.0).put("cup", 0.2, 0.0)
+    goal, top = layout.graph(), 0.08
+
+    def with_thing(bottom: float) -> SceneGraph:
+        """Something 4 cm high over the box's middle, metres above the table."""
+        centre, extent = np.array([0.0, 0.0, bottom + 0.02]), np.array([0.05, 0.05, 0.04])
+        thing = UnknownRegion(box=np.zeros(4), points=500, centre_table=centre, extent_table=extent)
+        return msgspec.structs.replace(goal, unknown=(thing,))
+
+    for taught, seen in ((goal, with_thing(top - 0.04)), (with_thing(top), with_thing(top))):
+        episode = Episode(repeats=0)
+        episode.until_start(taught)
+        assert the_verdict(episode.seen(seen)).success, "it stands beside the box, or stood there in the goal"
+
+    episode = Episode(repeats=1)
+    episode.until_start(goal)
+    (look,) = episode.seen(with_thing(top))
+    assert look == LookRequest(purpose="start, look 2"), "it may be gone at the next look"
+    verdict = the_verdict(episode.seen(with_thing(top)))
+    assert (verdict.failed_stage, verdict.reason) == (
+        "perception", "something unknown stands on tea_box, which the goal wants clear (2 looks at scene 'start'); "
+        "every other relation of the goal holds",
+    )  # fmt: skip
+    assert [str(item) for item in verdict.violated] == ["clear(tea_box)"]
+    assert len(verdict.satisfied) == len(goal.assertions) - 1
+
+    episode = Episode(repeats=1)
+    episode.until_start(goal)
+    episode.seen(with_thing(top))
+    assert the_verdict(episode.seen(goal)).success
+
+
 UNUSABLE = msgspec.structs.replace(BLIND, unusable="look 3: no support plane")
 """What a look shows that somebody leans into; the scene graph that comes with it is empty."""
 NOTHING = without(GOAL, {item.name for item in GOAL.objects})

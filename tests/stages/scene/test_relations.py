@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.scene.relations import Tolerances, gaps, penetration
+from stages.messages.scene import UnknownRegion
+from stages.scene.relations import Tolerances, gaps, is_covered, penetration
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, asserted, breakfast, carried, catalogue, label_of, stances
 
@@ -224,3 +225,25 @@ def test_neighbours_penetrate_each_other_by_the_shortest_way_out():
     assert penetration(a, b, Tolerances()) == pytest.approx(0.03, abs=2e-3)
     layout.poses["soup_can"][0, 3] += 0.04
     assert penetration(Standing.at("soup_can", stances("soup_can"), layout.poses["soup_can"]), b, Tolerances()) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("label", "x", "bottom", "top", "covered"),
+    [
+        ("tea_box", 0.0, 0.085, 0.12, True),
+        ("tea_box", 0.0, 0.065, 0.12, True),
+        ("tea_box", 0.0, 0.02, 0.12, False),  # Part of something on the table.
+        ("tea_box", 0.0, 0.085, 0.1, False),  # The box, estimated too low.
+        ("tea_box", 0.0, 0.2, 0.25, False),  # Hangs over it.
+        ("tea_box", 0.03, 0.085, 0.12, False),  # Over the edge.
+        ("bowl", 0.0, 0.02, 0.1, True),
+        ("bowl", 0.0, 0.02, 0.06, False),  # The wall.
+    ],
+)
+def test_what_no_object_explains_stands_on_what_it_is_clearly_above(
+    label: str, x: float, bottom: float, top: float, covered: bool
+) -> None:
+    item = Standing.at(label, stances(label), Layout().put(label, 0.2, 0.1).poses[label])
+    centre, extent = np.array([0.2 + x, 0.1, (bottom + top) / 2]), np.array([0.04, 0.04, top - bottom])
+    thing = UnknownRegion(box=np.zeros(4), points=200, centre_table=centre, extent_table=extent)
+    assert is_covered(item, (thing,), Tolerances()) == covered
