@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from itertools import islice
 from math import pi
 from pathlib import Path
@@ -57,13 +58,13 @@ from stages.scene.doubts import SURE, UNSURE, corrected, is_below, open_doubt, w
 from stages.scene.facing import shows
 from stages.scene.goals import check_name
 from stages.scene.goals import without as left_out
-from stages.scene.naming import exchanges
+from stages.scene.naming import best_exchange, exchanges
 from stages.scene.relations import Tolerances, gaps, is_covered
 from stages.scene.stance import TIPPED, Stances, is_tipped, standing_of, turned
 from stages.scene.virtual import satisfied, without
 
 _EXCHANGES = 200
-"""Ways to name equal objects that are compared."""
+"""Ways to name equal objects that are compared; where there are more, the one by single objects comes first."""
 _WRONG_SIDE = "is not seen to show the side that it should"
 _UNKNOWN = "something is there that no object explains"
 
@@ -541,9 +542,24 @@ class Demonstrator(Stage):
         ways = [names]
         if not (self._state.ask and which(scene, goal)):
             wanted = {item.name: item.label for item in goal.objects}
-            ways += islice(exchanges(labels, names, wanted), _EXCHANGES)
+            first = list(islice(exchanges(labels, names, wanted), _EXCHANGES + 1))
+            if len(first) > _EXCHANGES:
+                ways.append(best_exchange(labels, names, wanted, partial(self._worth, scene, goal)))
+            ways += first[:_EXCHANGES]
         held = [len(satisfied(goal, self._memory.renamed(scene, way), self._catalogue)[0]) for way in ways]
         return dict(zip(names, ways[held.index(max(held))], strict=True))
+
+    def _worth(self, scene: SceneGraph, goal: SceneGraph, i: int, name: str) -> float:
+        """How many relations of the goal about that name hold if the scene's object ``i`` has it; of equal numbers the
+        one nearer to where the goal shows it is worth more."""
+        names = [item.name for item in scene.objects]
+        exchanged = [names[i] if other == name else other for other in names]
+        exchanged[i] = name
+        held, _ = satisfied(goal, self._memory.renamed(scene, exchanged), self._catalogue)
+        about = {name, *(item.name for item in goal.virtual_objects if name in (item.parent, item.child))}
+        shown = [item.T_base_object[:3, 3] for item in goal.objects if item.name == name]
+        near = [1 / (1 + np.linalg.norm(place - scene.objects[i].T_base_object[:3, 3])) for place in shown]
+        return sum(not about.isdisjoint(item.arguments) for item in held) + float(sum(near)) / (len(names) + 1)
 
     def _missing(self, scene: SceneGraph) -> str:
         """What the scene lacks that it must show, in words; empty where it is complete."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count, permutations, product
 
@@ -66,14 +66,35 @@ def exchanges(labels: Sequence[str], names: Sequence[str], wanted: Mapping[str, 
 
     Those of a label take the names ``wanted`` for it (name -> label), and beyond these their own.
     """
-    groups = {label: [i for i, other in enumerate(labels) if other == label] for label in labels}
-    pools = {label: [name for name, other in wanted.items() if other == label] for label in groups}
-    for label, mine in groups.items():
-        spare = [names[i] for i in mine if names[i] not in pools[label]]
-        pools[label] += spare[: max(0, len(mine) - len(pools[label]))]
-    for chosen in product(*(permutations(pools[label], len(mine)) for label, mine in groups.items())):
+    groups = _groups(labels, names, wanted)
+    for chosen in product(*(permutations(pool, len(mine)) for mine, pool in groups)):
         named = [*names]
-        for mine, order in zip(groups.values(), chosen, strict=True):
+        for (mine, _), order in zip(groups, chosen, strict=True):
             for i, name in zip(mine, order, strict=True):
                 named[i] = name
         yield named
+
+
+def best_exchange(
+    labels: Sequence[str], names: Sequence[str], wanted: Mapping[str, str], worth: Callable[[int, str], float]
+) -> list[str]:
+    """The one of the :func:`exchanges` whose objects are together ``worth`` most, each by its number and new name."""
+    named = [*names]
+    for mine, pool in _groups(labels, names, wanted):
+        worths = np.array([[worth(i, name) for name in pool] for i in mine])
+        for row, column in zip(*linear_sum_assignment(worths, maximize=True), strict=True):
+            named[mine[row]] = pool[column]
+    return named
+
+
+def _groups(
+    labels: Sequence[str], names: Sequence[str], wanted: Mapping[str, str]
+) -> list[tuple[list[int], list[str]]]:
+    """Per label the numbers of its objects and the names that they may take, at least as many."""
+    groups: list[tuple[list[int], list[str]]] = []
+    for label in dict.fromkeys(labels):
+        mine = [i for i, other in enumerate(labels) if other == label]
+        pool = [name for name, other in wanted.items() if other == label]
+        spare = [names[i] for i in mine if names[i] not in pool]
+        groups.append((mine, pool + spare[: max(0, len(mine) - len(pool))]))
+    return groups

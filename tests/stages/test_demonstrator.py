@@ -184,6 +184,25 @@ def test_what_nobody_recognised_on_what_the_goal_wants_clear_is_no_success() -> 
     assert the_verdict(episode.seen(goal)).success
 
 
+@pytest.mark.parametrize("turn", [1, 3])
+def test_a_goal_of_many_equal_objects_holds_whichever_is_which(turn: int) -> None:
+    """Six shakers, one on each carrier, can be named in 720 ways."""
+    carriers = ["tea_box", "sugar_box", "milk_carton", "soup_can", "tuna_can", "cereal_box"]
+    shakers = ["salt_shaker", *(f"salt_shaker_{k}" for k in range(2, 7))]
+
+    def laid_out(names: list[str]) -> SceneGraph:
+        layout = Layout()
+        for k, carrier in enumerate(carriers):
+            layout.put(carrier, 0.12 * k - 0.3, 0.0)
+        for name, carrier in sorted(zip(names, carriers, strict=True)):
+            layout.put(name, 0.0, 0.0, on=carrier)
+        return layout.graph()
+
+    episode = Episode()
+    episode.until_start(laid_out(shakers))
+    assert the_verdict(episode.seen(laid_out(shakers[turn:] + shakers[:turn]))).success
+
+
 UNUSABLE = msgspec.structs.replace(BLIND, unusable="look 3: no support plane")
 """What a look shows that somebody leans into; the scene graph that comes with it is empty."""
 NOTHING = without(GOAL, {item.name for item in GOAL.objects})

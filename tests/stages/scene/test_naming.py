@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.scene.naming import Named, exchanges, names_kept, unique_names
+from stages.scene.naming import Named, best_exchange, exchanges, names_kept, unique_names
 
 
 @pytest.mark.parametrize(
@@ -64,3 +64,17 @@ def test_what_is_exchanged_takes_the_names_that_are_wanted_first() -> None:
     assert list(exchanges(["cup"], ["cup_2"], wanted)) == [["cup"], ["cup_3"]]
     three = list(exchanges(["cup"] * 3, ["cup_2", "cup", "cup_5"], wanted))
     assert len(three) == 6 and {frozenset(names) for names in three} == {frozenset({"cup", "cup_3", "cup_2"})}
+
+
+def test_the_best_exchange_is_the_one_whose_objects_are_worth_most() -> None:
+    labels, names = ["cup", "bowl", "cup", "cup"], ["cup", "bowl", "cup_2", "cup_3"]
+    wanted = {"cup": "cup", "cup_2": "cup"}
+    worths = {(0, "cup"): 2.0, (2, "cup"): 3.0, (0, "cup_2"): 1.0, (2, "cup_2"): 3.0}
+    best = best_exchange(labels, names, wanted, lambda i, name: worths.get((i, name), 0.0))
+    assert best == ["cup", "bowl", "cup_2", "cup_3"]
+    worths[0, "cup_2"] = 4.0
+    assert best_exchange(labels, names, wanted, lambda i, name: worths.get((i, name), 0.0))[:3] == [
+        "cup_2",
+        "bowl",
+        "cup",
+    ]
