@@ -12,7 +12,7 @@ from stages.geometry.poses import inverse
 from stages.messages import Observation, SceneGraph
 from stages.messages.scene import SceneObject
 from stages.perception.filter.likelihood import ObservedScene, Shape
-from stages.perception.hypotheses.unexplained import is_contradicted, looked_through
+from stages.perception.hypotheses.unexplained import is_seen_empty
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene import relations, virtual
 from stages.scene.catalogue import Catalogue
@@ -41,8 +41,9 @@ _WALL = 0.003
 class Memory:
     """Completes scenes with what was known before.
 
-    A place counts as empty where the camera looks through what would stand there, other objects apart: the same test
-    by which an estimate is contradicted. What is hidden, or shows without being recognised, stays.
+    A place counts as empty where the camera looks through what would stand there, other objects apart: the test by
+    which an estimate is contradicted, or, of what is flat, through nearly all that stands out of what is behind it.
+    What is hidden, or shows without being recognised, stays.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
@@ -127,7 +128,7 @@ class Memory:
         view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
         layers = [self._layer(other, view, observation) for other in others]
         nearest = np.maximum.reduce([view.plane_inverse, *layers])
-        return is_contradicted(looked_through(view, self._layer(item, view, observation), nearest))
+        return is_seen_empty(view, self._layer(item, view, observation), nearest)
 
     def _layer(self, item: SceneObject, view: ObservedScene, observation: Observation) -> Float32s:
         assert observation.T_base_camera is not None

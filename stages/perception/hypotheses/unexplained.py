@@ -29,6 +29,13 @@ _POINTS = 40
 """Readings that a region has at least."""
 _CONTRADICTED = 0.3
 """Share of an object's visible silhouette that the camera looks through if the object cannot be there."""
+_ROOM = 1.4
+"""Times the margin by which what is behind an object must be behind it for the camera to tell that it is gone."""
+_GONE = 0.9
+"""Share of such places that it looks through if a flat object is gone; of a tray that is 2 cm beside where it is taken
+to be, up to 0.87."""
+_SHOWN = 0.5
+"""Share of the silhouette that must be in sight for that."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +74,21 @@ def looked_through(scene: ObservedScene, layer: Float32s, others: Float32s) -> f
     ``layer`` and ``others`` are H x W inverse depths of the object, and of the plane and all other objects. 0 where
     there are no readings: no evidence.
     """
-    if not layer.any():
-        return 0.0
-    part = part_of(layer > 0)
-    layer, depth = layer[part], scene.depth[part]
-    inner = eroded(layer > 0, max(1, _edge(scene) // 2))
-    seen = inner & (layer >= others[part]) & (scene.factor[part] > 0)
-    behind = depth - 1.0 / np.where(seen, layer, 1.0)
-    through = seen & (behind > _margin(depth))
+    seen, through, _ = _against(scene, layer, others)
     return float(through.sum() / max(1, seen.sum()))
+
+
+def is_seen_empty(scene: ObservedScene, layer: Float32s, others: Float32s) -> bool:
+    """Whether an object that was there is not there any more; arguments as of :func:`looked_through`.
+
+    Behind most of a flat one, such as a tray, the plane is too near to tell: where enough of it would show, it is gone
+    if the camera looks through nearly all of what stands out.
+    """
+    seen, through, telling = _against(scene, layer, others)
+    if is_contradicted(through.sum() / max(1, seen.sum())):
+        return True
+    shows = telling.sum() >= _POINTS and seen.sum() >= _SHOWN * (layer > 0).sum()
+    return bool(shows and (telling & through).sum() > _GONE * telling.sum())
 
 
 def is_contradicted(share: float) -> bool:
@@ -95,6 +108,25 @@ def unexplained(scene: ObservedScene, layers: Sequence[Float32s], *, edge: int) 
         rim = dilated(shown, edge) & ~eroded(shown, edge)
         open_readings[part] &= ~(on_it | rim)
     return open_readings
+
+
+def _against(scene: ObservedScene, layer: Float32s, others: Float32s) -> tuple[Mask, Mask, Mask]:
+    """Where readings are in an object's visible silhouette, its rim apart; where of these they are clearly behind its
+    surface; and where they would be, with room for noise, if it was gone. In the smallest part of the image about it.
+    """
+    part = part_of(layer > 0)
+    if not layer[part].size:
+        return (np.zeros((0, 0), bool),) * 3
+    layer, depth, others = layer[part], scene.depth[part], others[part]
+    inner = eroded(layer > 0, max(1, _edge(scene) // 2))
+    seen = inner & (layer >= others) & (scene.factor[part] > 0)
+    surface = 1.0 / np.where(seen, layer, 1.0)
+    behind = 1.0 / np.maximum(others, 1e-6)
+    return (
+        seen,
+        seen & (depth - surface > _margin(depth)),
+        seen & (behind - surface > _ROOM * _margin(depth)),
+    )
 
 
 def _region(scene: ObservedScene, part: Mask, left: int, top: int) -> UnexplainedRegion | None:

@@ -73,6 +73,15 @@ def test_a_half_hidden_place_that_is_empty_is_seen_empty() -> None:
     assert names(completed({"milk_carton": CARTON}, before, {"milk_carton": CARTON})) == ["milk_carton"]
 
 
+def test_a_tray_that_is_taken_away_is_forgotten_and_one_that_was_pushed_is_not() -> None:
+    can = {"tuna_can": upright("tuna_can", 0.25, -0.1, 0.0)}
+    tray = {**can, "tray": upright("tray", 0.0, -0.15, 0.0)}
+    assert names(completed(can, tray, can)) == ["tuna_can"]
+    for x, y in ((0.0, -0.15), (-0.01, -0.15), (0.01, -0.15), (0.0, -0.16), (0.0, -0.14), (0.015, -0.14)):
+        pushed = {**can, "tray": upright("tray", x, y, 0.05)}
+        assert names(completed(can, tray, pushed)) == ["tuna_can", "tray"]
+
+
 def test_what_is_seen_elsewhere_is_there() -> None:
     moved = {"milk_carton": CARTON, "salt_shaker": upright("salt_shaker", 0.15, -0.1, 0.0)}
     scene = completed(moved, {"milk_carton": CARTON, "salt_shaker": BEHIND}, moved)
