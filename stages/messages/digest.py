@@ -41,6 +41,9 @@ class Observation(Message, frozen=True, kw_only=True):
     """K x 2, metres: corners of the support surface as far as it was seen, in the table's frame, counter-clockwise."""
     unusable: str = ""
     """Why nothing is to be seen in the frame, in words: then there is no reading, and the plane is no real one."""
+    beyond: Depth | None = None
+    """Metres outside the working area; 0 in it, where there is no reading and where the robot is. None in recordings
+    that were made before the field was."""
 
 
 class ParticleTrace(Struct, frozen=True, kw_only=True):

@@ -37,6 +37,7 @@ TOLERANCES = {
     "Observation.foreground": IMAGE,
     "Observation.T_camera_table": PLANE,
     "Observation.support": SHOWN,
+    "Observation.beyond": IMAGE,
     "ParticleTrace.iterations": SHOWN,
     "ParticleTrace.costs": SHOWN,
     "ParticleTrace.positions": SHOWN,

@@ -43,7 +43,8 @@ class Memory:
 
     A place counts as empty where the camera looks through what would stand there, other objects apart: the test by
     which an estimate is contradicted, or, of what is flat, through nearly all that stands out of what is behind it.
-    What is hidden, or shows without being recognised, stays.
+    That holds in all of the image, also where no objects were looked for. What is hidden, or shows without being
+    recognised, stays.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
@@ -125,7 +126,7 @@ class Memory:
         return self.related(msgspec.structs.replace(scene, objects=objects, virtual_objects=beside), objects)
 
     def _seen_empty(self, item: SceneObject, others: Sequence[SceneObject], observation: Observation) -> bool:
-        view = ObservedScene.of(observation.depth, observation.foreground, observation.K, observation.T_camera_table)
+        view = _view(observation)
         layers = [self._layer(other, view, observation) for other in others]
         nearest = np.maximum.reduce([view.plane_inverse, *layers])
         return is_seen_empty(view, self._layer(item, view, observation), nearest)
@@ -164,6 +165,12 @@ class Memory:
             virtual_objects=near,
             assertions=(*relations.assertions(carried), *virtual.assertions(near)),
         )
+
+
+def _view(observation: Observation) -> ObservedScene:
+    """All that the camera saw, also where it looked for no objects."""
+    depth = observation.depth if observation.beyond is None else np.maximum(observation.depth, observation.beyond)
+    return ObservedScene.of(depth, observation.foreground, observation.K, observation.T_camera_table)
 
 
 def _surer(item: SceneObject, other: SceneObject) -> bool:

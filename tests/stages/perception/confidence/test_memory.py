@@ -6,9 +6,10 @@ import pytest
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
-from stages.messages import Observation, SceneGraph
+from stages.messages import Candidate, Frame, Observation, SceneGraph
 from stages.messages.scene import SceneObject
 from stages.perception.confidence.memory import Memory
+from stages.perception.observation.preprocessing import preprocess
 from stages.scene import virtual
 from tests.stages.layouts import T_BASE_TABLE, Layout, asserted
 from tests.stages.perception.scenes import CATALOGUE, K, camera, render, upright
@@ -37,6 +38,19 @@ def observation(placed: dict[str, Floats]) -> Observation:
         T_camera_table=scene.T_camera_table,
         T_base_camera=T_BASE_TABLE @ inverse(camera()),
     )
+
+
+def looked_at(true: dict[str, Floats], found: str) -> Observation:
+    """What a camera keeps of a scene that finds one object of it: little but the surroundings of that one."""
+    rendered = render(true)
+    depth = rendered.scene.depth
+    frame = Frame(
+        rgb=np.zeros((*depth.shape, 3), np.uint8), depth=depth, K=K, T_base_camera=None, robot_mask=None,
+        name="look", index=0, total=1,
+    )  # fmt: skip
+    candidate = Candidate(box=rendered.boxes[found], label=found, confidence=0.9)
+    kept = preprocess(frame, [candidate], np.random.default_rng(0), max_height=0.6)
+    return msgspec.structs.replace(kept, T_base_camera=T_BASE_TABLE @ inverse(camera()))
 
 
 def completed(seen: dict[str, Floats], before: dict[str, Floats], true: dict[str, Floats]) -> SceneGraph:
@@ -80,6 +94,20 @@ def test_a_tray_that_is_taken_away_is_forgotten_and_one_that_was_pushed_is_not()
     for x, y in ((0.0, -0.15), (-0.01, -0.15), (0.01, -0.15), (0.0, -0.16), (0.0, -0.14), (0.015, -0.14)):
         pushed = {**can, "tray": upright("tray", x, y, 0.05)}
         assert names(completed(can, tray, pushed)) == ["tuna_can", "tray"]
+
+
+@pytest.mark.parametrize(
+    ("instead", "left"),
+    [({}, ["cup"]), ({"mug": 0.153}, ["cup", "mug"]), ({"milk_carton": 0.15}, ["cup", "mug"])],
+)
+def test_what_is_taken_away_far_from_what_is_left_is_forgotten(instead: dict[str, float], left: list[str]) -> None:
+    """The mug's place is outside the working area, which is around the cup; the mug is kept where something that is not
+    recognised hides its place, or where it is itself, pushed a little."""
+    cup = {"cup": upright("cup", -0.2, 0.0, 0.0)}
+    before = known({**cup, "mug": upright("mug", 0.15, 0.0, 0.0)})
+    true = {**cup, **{name: upright(name, x, 0.0, 0.0) for name, x in instead.items()}}
+    look = looked_at(true, "cup")
+    assert names(MEMORY.complete(graph(cup), before, look)) == left
 
 
 def test_what_is_seen_elsewhere_is_there() -> None:

@@ -1,5 +1,6 @@
 """The observation of a frame: whose support plane it has."""
 
+import msgspec
 import numpy as np
 
 from stages.messages import Candidate, Frame
@@ -39,3 +40,14 @@ def test_unsure_candidates_on_the_floor_do_not_make_it_the_support() -> None:
     ]
     assert abs(height_of_the_box([box, *floor]) - 0.1) < 0.01
     assert height_of_the_box(floor) > 0.5
+
+
+def test_what_is_seen_beyond_the_working_area_is_kept_apart() -> None:
+    robot = np.zeros((VIEW.height, VIEW.width), bool)
+    robot[:20], robot[60:62] = True, True
+    frame = msgspec.structs.replace(seen(), robot_mask=robot)
+    box = Candidate(box=np.array([70.0, 52.0, 90.0, 68.0]), label="box", confidence=0.7)
+    kept = preprocess(frame, [box], np.random.default_rng(0), max_height=0.9)
+    assert kept.beyond is not None
+    assert (kept.depth > 0).any() and not kept.depth[:, :60].any() and not kept.beyond[42:78, 60:100].any()
+    np.testing.assert_array_equal(kept.depth + kept.beyond, np.where(robot, 0, frame.depth))
