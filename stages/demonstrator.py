@@ -324,7 +324,7 @@ class Demonstrator(Stage):
             self._state = replace(state, phase=Phase.ASKING, question=question, shown=shown, asked=question.number)
             yield question
             return
-        scene_graph = self._memory.named(scene_graph, state.known)
+        scene_graph = self._memory.named(scene_graph, state.known, observation, state.seen)
         scene = self._memory.complete(scene_graph, state.known, observation)
         seen, ahead, unproved = state.seen | _names(scene_graph), state.views[1:], state.unproved
         if state.goal is not None and (not state.known or _spares(scene, state.goal)):

@@ -253,6 +253,18 @@ def test_a_new_scene_is_looked_at_from_all_views_and_what_one_shows_is_there() -
     assert episode.seen(part)[0] == LookRequest(purpose="after transfer 1, look 2, from view 1", view=1)
 
 
+def test_equal_objects_of_which_each_view_shows_another_one_are_all_in_the_goal() -> None:
+    both = view(Layout({**CARTON.poses, "salt_shaker": HIDDEN, "salt_shaker_2": OPEN}))
+    episode = Episode(robot=BUILT_IN.with_name("ur5e_hand.yaml"), scripted=False)
+    episode.called(Teach(name="shakers"))
+    for shaker in (HIDDEN, HIDDEN, OPEN):
+        goal, *_ = episode.seen(with_shaker(shaker).graph(), both)
+    assert isinstance(goal, Goal)
+    stand = {item.name: item.T_base_object for item in goal.scene.objects if item.label == "salt_shaker"}
+    np.testing.assert_allclose(stand["salt_shaker"], T_BASE_TABLE @ HIDDEN, atol=1e-9)
+    np.testing.assert_allclose(stand["salt_shaker_2"], T_BASE_TABLE @ OPEN, atol=1e-9)
+
+
 def test_what_was_knocked_over_is_set_upright_and_named_where_it_cannot_be() -> None:
     episode = Episode(repeats=0)
     episode.until_transfer()

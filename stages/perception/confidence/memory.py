@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -100,21 +100,39 @@ class Memory:
         others = [other for other in scene.objects if other.name != item.name]
         return item if self._seen_empty(before, others, observation) else before
 
-    def named(self, scene: SceneGraph, known: Mapping[str, SceneObject]) -> SceneGraph:
+    def named(
+        self,
+        scene: SceneGraph,
+        known: Mapping[str, SceneObject],
+        observation: Observation,
+        still: Collection[str] = (),
+    ) -> SceneGraph:
         """Equal objects with the names of those that are known where they stand: who moved one knows where it went.
 
-        Where none is known to have stood, the only one of its kind keeps its name.
+        Where none is known to have stood, the only one of its kind keeps its name. But those that earlier views of the
+        same scene have shown are ``still`` there unless the observation tells otherwise: their names are their own.
         """
         labels = [item.label for item in scene.objects]
         if not known or not labels:
             return scene
         before = {name: Named(item.label, item.T_base_object[:3, 3]) for name, item in known.items()}
         kept = names_kept(labels, np.stack([item.T_base_object[:3, 3] for item in scene.objects]), before)
+        hidden = {
+            name: item.label
+            for name, item in known.items()
+            if name in still and name not in kept and item.label in labels and self._may_stand(item, scene, observation)
+        }
         kept = [
-            item.name if name is None and labels.count(item.label) == 1 else name
+            item.name if name is None and labels.count(item.label) == 1 and item.name not in hidden else name
             for item, name in zip(scene.objects, kept, strict=True)
         ]
-        return self.renamed(scene, unique_names(labels, kept))
+        return self.renamed(scene, unique_names([*labels, *hidden.values()], [*kept, *hidden])[: len(labels)])
+
+    def _may_stand(self, item: SceneObject, scene: SceneGraph, observation: Observation) -> bool:
+        """Whether what the scene lacks may be where it was: nothing else is seen there, nor that it is gone."""
+        if observation.T_base_camera is None or any(self._overlap(item, other, scene) for other in scene.objects):
+            return False
+        return not self._seen_empty(item, scene.objects, observation)
 
     def renamed(self, scene: SceneGraph, names: Sequence[str]) -> SceneGraph:
         """The same scene, its objects with these names."""

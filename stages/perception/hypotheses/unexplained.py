@@ -116,7 +116,8 @@ def _against(scene: ObservedScene, layer: Float32s, others: Float32s) -> tuple[M
     """
     part = part_of(layer > 0)
     if not layer[part].size:
-        return (np.zeros((0, 0), bool),) * 3
+        nowhere = np.zeros((0, 0), bool)
+        return nowhere, nowhere, nowhere
     layer, depth, others = layer[part], scene.depth[part], others[part]
     inner = eroded(layer > 0, max(1, _edge(scene) // 2))
     seen = inner & (layer >= others) & (scene.factor[part] > 0)

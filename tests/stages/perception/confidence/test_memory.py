@@ -56,7 +56,8 @@ def looked_at(true: dict[str, Floats], found: str) -> Observation:
 def completed(seen: dict[str, Floats], before: dict[str, Floats], true: dict[str, Floats]) -> SceneGraph:
     """The scene that shows ``seen`` of what is truly there, to somebody who knew of ``before``."""
     remembered = known(before)
-    return MEMORY.complete(MEMORY.named(graph(seen), remembered), remembered, observation(true))
+    look = observation(true)
+    return MEMORY.complete(MEMORY.named(graph(seen), remembered, look), remembered, look)
 
 
 def names(scene: SceneGraph) -> list[str]:
@@ -222,7 +223,7 @@ def test_what_stands_beside_an_equal_object_that_is_renamed_stays_beside_it() ->
         upright("tea_box", 0.29, 0.0, 0.0),
     )
     seen = graph({"sponge": here, "sponge_2": there, "tea_box": box})
-    scene = MEMORY.named(seen, known({"sponge_2": here, "sponge": there}))
+    scene = MEMORY.named(seen, known({"sponge_2": here, "sponge": there}), observation({}))
     (region,) = scene.virtual_objects
     assert {region.parent, region.child} == {"sponge_2", "tea_box"}
 
@@ -230,12 +231,13 @@ def test_what_stands_beside_an_equal_object_that_is_renamed_stays_beside_it() ->
 def test_the_only_one_of_its_kind_keeps_the_name_that_is_known_where_it_stands() -> None:
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
     for seen, expected in ((here, "sponge"), (there, "sponge_2")):
-        assert names(MEMORY.named(graph({"sponge_2": seen}), known({"sponge": here}))) == [expected]
+        assert names(MEMORY.named(graph({"sponge_2": seen}), known({"sponge": here}), observation({}))) == [expected]
 
 
 def test_the_only_one_that_is_seen_of_two_is_the_one_that_is_known_where_it_stands() -> None:
     here, there = upright("sponge", 0.15, 0.0, 0.0), upright("sponge", -0.15, 0.0, 0.0)
-    assert names(MEMORY.named(graph({"sponge": there}), known({"sponge": here, "sponge_2": there}))) == ["sponge_2"]
+    before = known({"sponge": here, "sponge_2": there})
+    assert names(MEMORY.named(graph({"sponge": there}), before, observation({}))) == ["sponge_2"]
 
 
 @pytest.mark.parametrize(
@@ -308,6 +310,32 @@ def test_what_surely_stands_in_a_mug_does_not_say_that_there_is_none() -> None:
     sure = tuple(msgspec.structs.replace(item, probability=0.99) for item in graph(layout.poses).objects[1:])
     seen = msgspec.structs.replace(graph({"water_bottle": layout.poses["water_bottle"]}), objects=sure)
     assert names(MEMORY.complete(seen, before, observation(layout.poses))) == ["water_bottle", "mug"]
+
+
+@pytest.mark.parametrize(
+    ("gone", "before", "expected"),
+    [
+        (False, {"salt_shaker": BEHIND}, ["milk_carton", "salt_shaker_2", "salt_shaker"]),
+        (True, {"salt_shaker": HALF_BEHIND}, ["milk_carton", "salt_shaker"]),
+        (False, {"salt_shaker_2": BEHIND}, ["milk_carton", "salt_shaker", "salt_shaker_2"]),
+    ],
+)
+def test_what_another_view_showed_keeps_its_name_while_it_may_be_hidden(
+    gone: bool, before: dict[str, Floats], expected: list[str]
+) -> None:
+    """An equal one is seen elsewhere from here: it is another one, unless the place of the first is seen empty."""
+    seen = {"milk_carton": CARTON, "salt_shaker": upright("salt_shaker", 0.2, 0.0, 0.0)}
+    look = observation(seen if gone else {**seen, "salt_shaker_2": BEHIND})
+    remembered = known({"milk_carton": CARTON, **before})
+    scene = MEMORY.named(graph(seen), remembered, look, remembered.keys())
+    assert names(MEMORY.complete(scene, remembered, look)) == expected
+
+
+def test_two_that_another_view_showed_in_each_others_places_keep_their_names() -> None:
+    here, there = (0.15, -0.1, 0.0), (-0.15, -0.1, 0.0)
+    before = known({"mug": upright("mug", *here), "soup_can": upright("soup_can", *there)})
+    now = {"mug": upright("mug", *there), "soup_can": upright("soup_can", *here)}
+    assert names(MEMORY.named(graph(now), before, observation(now), before.keys())) == ["mug", "soup_can"]
 
 
 def test_equal_objects_are_those_that_are_known_where_they_stand() -> None:
