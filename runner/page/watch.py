@@ -47,6 +47,8 @@ class Watch:
         self._looked_at = threading.Event()
         self._telling = threading.Lock()
         self._story: Story | None = None
+        self._told: dict[Language, Told] = {}
+        """What was told last, by language."""
         self._prepared = False
         self._heard: dict[str, type[Message]] = {}
         """Types by topic."""
@@ -61,13 +63,24 @@ class Watch:
         self.caught_up &= somebody
 
     def tell(self, language: Language) -> Told:
-        """What there is to say now."""
+        """What there is to say now.
+
+        Where the story fails, what was told last, in another language if need be: a page keeps its buttons.
+        """
         with self._telling:
-            return self._story.tell(language) if self._story else NOTHING
+            try:
+                self._told[language] = self._story.tell(language) if self._story else NOTHING
+            except Exception as error:
+                print(f"nothing new can be told: {type(error).__name__}: {error}", file=sys.stderr)
+            return self._told.get(language) or next(reversed(self._told.values()), NOTHING)
 
     def say(self, refusal: str, language: Language) -> str:
-        """Why a stage refused a call, in the words of a language where somebody tells the story."""
-        return self._story.say(refusal, language) if self._story and refusal else refusal
+        """Why a stage refused a call, in the words of a language where somebody tells the story and knows them."""
+        try:
+            return self._story.say(refusal, language) if self._story and refusal else refusal
+        except Exception as error:
+            print(f"{refusal!r} cannot be told: {type(error).__name__}: {error}", file=sys.stderr)
+            return refusal
 
     def read(self) -> None:
         """Reads until the run ends, or as far as it is there once it is to stop."""

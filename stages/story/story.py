@@ -363,12 +363,14 @@ class Story:
         return View(self._photo, words.say("outdated" if self._moved else "seen"), found, arrows)
 
     def _arrows(self, words: Words) -> Iterator[Arrow]:
-        """What will be moved, from where it will be then."""
+        """What will be moved and is not hidden, from where it will be then."""
         job, scene = self._job, self._scene
         if job is None or scene is None or scene.T_base_camera is None:
             return
         places = {item.name: item.T_base_object for item in scene.objects}
         for transfer in job.transfers[job.done :]:
+            if transfer.object not in places:
+                continue
             start, end = places[transfer.object], transfer.T_base_targets[0]
             pixels = (pixel(T[:3, 3], scene.T_base_camera, scene.K) for T in (start, end))
             yield Arrow(_move(transfer, job, words), *pixels)

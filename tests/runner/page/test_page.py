@@ -17,9 +17,11 @@ from websockets.sync.client import connect
 
 from runner.contract import Refused
 from runner.page.guard import new_token
+from runner.page.watch import Watch
 from runner.testing import finish, read_until, runner, start_graph
 from tests.runner.common.waiting import wait_until
 from tests.runner.page.browser import browser, faults, opened
+from tests.runner.page.toys import LampStory
 
 LAMP = Path(__file__).with_name("lamp.yaml")
 VIEWS = ("scene", "history", "engineer")
@@ -350,6 +352,21 @@ def test_the_robot_in_3d_comes_from_the_same_address_and_calls_nobody_else(lamp:
     viewer = page.frame_locator("iframe[title='Robot in 3D']")
     expect(viewer.locator("canvas")).to_be_attached()
     assert all(url.startswith(lamp.url) or url.startswith(("data:", "blob:")) for url in called)
+
+
+def test_a_story_that_fails_takes_no_button_away(
+    lamp: Lamp, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (recording,) = lamp.folder.rglob("*.mcap")
+    watch = Watch(recording, lambda: None, lambda: True)
+    watch.look(True)
+    watch.read()
+    told = watch.tell("en")
+    for name in ("tell", "say"):
+        monkeypatch.delattr(LampStory, name)
+    assert told.actions and watch.tell("en") == watch.tell("de") == told
+    assert watch.say("times=10: makes people dizzy", "de") == "times=10: makes people dizzy"
+    assert "nothing new can be told: AttributeError: 'LampStory'" in capsys.readouterr().err
 
 
 def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:

@@ -453,6 +453,20 @@ def test_a_plan_is_shown_before_go_and_a_pause_holds_the_next() -> None:
     assert listener.doing == "Waits for your go; left to move: 1, about 1 min" and listener.offered()["go"]
 
 
+def test_what_is_hidden_and_still_to_be_moved_has_no_arrow() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    listener.seen(START)
+    listener.hear(
+        plan(STEP, transfer("tea_box", "table", "tray")), TransferRequest(transfer=STEP, scene=START, number=1)
+    )
+    listener.hear(outcome(1, STEP), LookRequest(purpose="after transfer 1"))
+    listener.seen(scene({"tray": "table", "cup": "tray"}))
+    view = listener.told().view
+    assert view is not None and view.arrows == () and listener.offered()["stop"]
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_a_doubt_is_a_question_until_it_is_answered(language: Language) -> None:
     doubts = [
