@@ -261,6 +261,8 @@ class Story:
             self._job = None  # it was a look, no more
 
     def _end(self, end: Goal | Verdict, id: str) -> None:
+        if isinstance(end, Verdict) and end.failed_stage == DEMONSTRATOR and self._job is not None:
+            return  # somebody else, who asked meanwhile, was refused
         if isinstance(end, Goal) and self._folder is None:  # else Kept says so, which may be heard before this goal
             self._goals[end.name] = Remembered(end, self._photo)
         self._ended, self._job = (end, id), None
@@ -417,7 +419,7 @@ class Story:
             draw = {"draw": str(self._draws)}
             yield Action(WORLD, "arrange", words.say("do_disturb"), {"kind": "start", **draw}, now=idle)
             yield Action(WORLD, "arrange", words.say("do_lay_out"), {"kind": "goal"}, now=idle)
-        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {"now": "true"}, kind="stop", now=not idle)
+        yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {"now": "true"}, kind="stop")
 
     def _map(self, words: Words) -> Map | None:
         """The scene from above, where people may move what carries nothing."""

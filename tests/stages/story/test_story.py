@@ -153,7 +153,7 @@ def test_before_the_first_look_there_is_nothing_to_see_and_something_to_do() -> 
         None,
         (),
     )
-    assert Listener().offered() == {"teach": True, "look": True, "arrange": True, "stop": False}
+    assert Listener().offered() == {"teach": True, "look": True, "arrange": True, "stop": True}
 
 
 def test_a_scene_is_sentences_and_outlines() -> None:
@@ -383,7 +383,17 @@ def test_what_the_arm_moves_for_before_a_look_is_said(shown: str, doing: str) ->
 def test_a_command_that_was_refused_changes_nothing() -> None:
     listener = Listener()
     listener.hear(Restore(name="lunch"), Stop())
-    assert (listener.doing, listener.offered()["stop"]) == ("The robot waits for you", False)
+    assert (listener.doing, listener.told().notice) == ("The robot waits for you", None)
+
+
+def test_who_is_refused_meanwhile_ends_no_job_and_never_the_stop() -> None:
+    listener = Listener()
+    refused = verdict("demonstrator", "busy: waits for the outcome of a transfer; ask again after the verdict")
+    listener.called(Restore(name="tea"))
+    listener.hear(plan(STEP), TransferRequest(transfer=STEP, scene=START, number=1), refused)
+    assert (listener.doing, listener.told().notice) == ("Puts the cup on the tray", None)
+    listener.hear(verdict("executor", "no"), refused)
+    assert listener.offered()["stop"] and not listener.notice.good
 
 
 def test_a_restore_is_told_step_by_step() -> None:
