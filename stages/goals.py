@@ -52,8 +52,11 @@ class Goals(Stage):
         self._picture = frame.rgb
 
     def on_goal(self, goal: Goal, ctx: Context) -> Kept:
-        """Keeps what was taught, with its picture."""
-        return self._write(msgspec.structs.replace(goal, picture=_jpeg(self._picture)), ctx)
+        """Keeps what was taught, with its picture; why it cannot be kept is a fault, for nobody waits for an answer."""
+        try:
+            return self._write(msgspec.structs.replace(goal, picture=_jpeg(self._picture)), ctx)
+        except Refused as refusal:
+            return self._kept(ctx, str(refusal))
 
     def on_forget(self, forget: Forget, ctx: Context) -> Kept:
         """Deletes a goal; one that is being restored still is."""
@@ -97,11 +100,12 @@ class Goals(Stage):
         ctx.log(f'goal "{goal.name}" kept in {self._folder.write(goal)}')
         return self._kept(ctx)
 
-    def _kept(self, ctx: Context) -> Kept:
-        goals, faults = self._folder.read()
+    def _kept(self, ctx: Context, *unwritten: str) -> Kept:
+        goals, unread = self._folder.read()
+        faults = (*unread, *unwritten)
         for fault in faults:
             ctx.log(fault, level="warning")
-        return Kept(goals=tuple(goals.values()), faults=tuple(faults))
+        return Kept(goals=tuple(goals.values()), faults=faults)
 
     def _goal(self, name: str) -> Goal:
         goals, _ = self._folder.read()

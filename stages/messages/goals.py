@@ -11,7 +11,7 @@ class Kept(Message, frozen=True, kw_only=True):
 
     goals: tuple[Goal, ...]
     faults: tuple[str, ...] = ()
-    """Folders beside them that hold none, and why."""
+    """Folders beside them that hold none or could not be written, and why."""
 
 
 class Forget(Command, frozen=True, kw_only=True):

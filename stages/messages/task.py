@@ -146,7 +146,7 @@ class Teach(Command, frozen=True, kw_only=True):
     answers = (Goal, Verdict)
 
     name: str
-    """Letters, digits, - and _."""
+    """Letters, digits, - and _, at most 100 bytes as UTF-8."""
     ask: bool = False
     """Asks where the look leaves something open."""
 

@@ -24,6 +24,8 @@ SCENE, PDDL, PICTURE = "scene.json", "goal.pddl", "picture.jpg"
 scene, the PDDL is the goal, as somebody wrote it."""
 MAX_BYTES = 10_000_000
 """Of a goal."""
+MAX_NAME_BYTES = 100
+"""Of the name of a goal, as UTF-8; most file systems take 255."""
 MAX_RADIUS = 0.5
 """Metres from where it was shown at which an object may still count as next to another."""
 
@@ -38,6 +40,8 @@ def check_name(place: str, name: str) -> None:
     """Refuses what cannot be the name of a folder."""
     if not name.replace("-", "").replace("_", "").isalnum():
         raise Refused(f"{place}: must consist of letters, digits, - and _ only")
+    if len(name.encode()) > MAX_NAME_BYTES:
+        raise Refused(f"{place}: must have at most {MAX_NAME_BYTES} bytes as UTF-8")
 
 
 class GoalFolder:
@@ -60,18 +64,35 @@ class GoalFolder:
         return goals, faults
 
     def write(self, goal: Goal) -> Path:
-        """Puts a goal in its folder, wholly or not at all; one of that name is replaced."""
+        """Puts a goal in its folder, wholly or not at all; one of that name is replaced.
+
+        Raises Refused where the disk does not take it.
+        """
         place, new = self._folder / goal.name, self._folder / f".{goal.name}.new"
-        shutil.rmtree(new, ignore_errors=True)
-        new.mkdir(parents=True)
-        for name, content in files_of(goal).items():
-            (new / name).write_bytes(content)
-        shutil.rmtree(place, ignore_errors=True)
-        return new.rename(place)
+        try:
+            _delete(new)
+            new.mkdir(parents=True)
+            for name, content in files_of(goal).items():
+                (new / name).write_bytes(content)
+            _delete(place)
+            return new.rename(place)
+        except OSError as error:
+            raise Refused(f"{place}: cannot be written: {error.strerror}") from None
 
     def remove(self, name: str) -> None:
-        """Deletes a goal."""
-        shutil.rmtree(self._folder / name)
+        """Deletes a goal; of one that is a link, the link. Raises Refused where the disk does not let go of it."""
+        try:
+            _delete(self._folder / name)
+        except OSError as error:
+            raise Refused(f"{self._folder / name}: cannot be deleted: {error.strerror}") from None
+
+
+def _delete(folder: Path) -> None:
+    """A folder and all that is in it, or a link to one; there may be none."""
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.exists():
+        shutil.rmtree(folder)
 
 
 def files_of(goal: Goal) -> dict[str, bytes]:

@@ -19,6 +19,8 @@ REASONS = {
     "empty": rf"name={_TEXT}: names no object; .*",
     "taken": rf"\w+={_TEXT}: there is a goal of that name.*",
     "no_name": rf"\w+={_TEXT}: must consist of letters, digits, - and _ only",
+    "too_long": rf"\w+={_TEXT}: must have at most {_NUMBER} bytes as UTF-8",
+    "not_written": r".*: cannot be (?:written|deleted): (?P<text>.*)",
     "no_file": r"file: is no goal: .*",
     "idle": r"nothing is under way",
     "no_go": r"nothing waits for go",

@@ -137,6 +137,40 @@ def test_what_lies_beside_the_goals_is_named_and_left_alone(tmp_path: Path) -> N
     assert line.startswith(f"{tmp_path}/broken: is no goal: Object missing required field `virtual_objects`")
 
 
+def test_a_name_is_at_most_as_long_as_a_folder_can_have(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.taught("tea")
+    robot.called(Rename(name="tea", to="ü" * 50))
+    with pytest.raises(Refused, match=r"to='ü{51}': must have at most 100 bytes as UTF-8"):
+        robot.called(Rename(name="ü" * 50, to="ü" * 51))
+    assert list(robot.goals()) == ["ü" * 50]
+
+
+def test_what_the_disk_does_not_take_is_said_and_ends_nothing(tmp_path: Path) -> None:
+    Robot(tmp_path / "here").taught("tea")
+    file = packed(Robot(tmp_path / "here").kept.goals[0])
+    (tmp_path / "goals").write_text("no folder")
+    robot = Robot(tmp_path / "goals")
+    robot.taught("tea")
+    why = f"{tmp_path}/goals/tea: cannot be written: Not a directory"
+    assert robot.kept == Kept(goals=(), faults=(why,)) and robot.ctx.lines == [why]
+    with pytest.raises(Refused, match=why):
+        robot.called(Add(file=file))
+
+
+def test_of_a_goal_that_is_a_link_only_the_link_is_deleted(tmp_path: Path) -> None:
+    Robot(tmp_path / "there").taught("tea")
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "tea").symlink_to(tmp_path / "there" / "tea")
+    robot = Robot(tmp_path / "here")
+    robot.called(Strike(name="tea", what="cup"))
+    robot.called(Forget(name="tea"))
+    (tmp_path / "here" / "tea").symlink_to(tmp_path / "there" / "tea")
+    robot.called(Forget(name="tea"))
+    assert robot.goals() == {} and not any((tmp_path / "here").iterdir())
+    assert facts(Robot(tmp_path / "there").scene()) == facts(TEA)
+
+
 # ------------------------------------------------------------------------------------------ what does not matter
 
 

@@ -19,6 +19,10 @@ SAID = {
     "to='a b': must consist of letters, digits, - and _ only": (
         "„a b“ geht nicht als Name: nur Buchstaben, Ziffern, - und _"
     ),
+    "name='Frühstück': must have at most 100 bytes as UTF-8": "„Frühstück“ ist als Name zu lang",
+    "/home/a b/goals/tea: cannot be written: No space left on device": (
+        "die Festplatte lässt mich nicht ändern, was ich mir gemerkt habe: No space left on device"
+    ),
     "as asked on the way to show 2": "angehalten, wie gewünscht",
     "stopped, the way back is barred: 31 N at the hand on the way to go home; in the hand: cup": (
         "der Arm bleibt, wo er ist, denn der Weg zurück ist versperrt: der Arm ist an etwas gestoßen; "
