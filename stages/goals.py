@@ -45,6 +45,7 @@ class Goals(Stage):
 
     def on_start(self, ctx: Context) -> Kept:
         """Reads what was taught before."""
+        self._folder.put_back()
         return self._kept(ctx)
 
     def on_frame(self, frame: Frame) -> None:
@@ -118,6 +119,8 @@ class Goals(Stage):
         check_name(place, name)
         if name in self._folder.read()[0]:
             raise Refused(f"{place}: there is a goal of that name; choose another, or delete that one first")
+        if self._folder.has(name):
+            raise Refused(f"{place}: there is a folder of that name in {self._where} that is no goal; choose another")
 
 
 def _changed(name: str, goal: Goal, scene: SceneGraph) -> Goal:

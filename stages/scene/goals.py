@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
 import os
 import shutil
 import zipfile
@@ -54,7 +56,7 @@ class GoalFolder:
     def read(self) -> tuple[dict[str, Goal], list[str]]:
         """All goals by name, and why what else is there is none."""
         goals, faults = dict[str, Goal](), list[str]()
-        for folder in sorted({path.parent for file in (SCENE, PDDL) for path in self._folder.glob(f"*/{file}")}):
+        for folder in sorted({path.parent for file in (SCENE, PDDL) for path in self._folder.glob(f"[!.]*/{file}")}):
             try:
                 check_name(str(folder), folder.name)
                 files = {file.name: file.read_bytes() for file in folder.iterdir()}
@@ -63,28 +65,51 @@ class GoalFolder:
                 faults.append(f"{folder}: {error}")
         return goals, faults
 
+    def has(self, name: str) -> bool:
+        """Whether there is something of that name, be it a goal or not."""
+        return os.path.lexists(self._folder / name)
+
+    def put_back(self) -> None:
+        """Puts back what was there before a write that was broken off."""
+        for old in self._folder.glob(".*.old"):
+            name = old.name[1 : -len(".old")]
+            with contextlib.suppress(OSError):
+                _delete(old) if self.has(name) else old.rename(self._folder / name)
+
     def write(self, goal: Goal) -> Path:
-        """Puts a goal in its folder, wholly or not at all; one of that name is replaced.
+        """Puts a goal in its folder, wholly or not at all; one of that name is replaced, what cannot be read put aside.
 
         Raises Refused where the disk does not take it.
         """
-        place, new = self._folder / goal.name, self._folder / f".{goal.name}.new"
+        place = self._folder / goal.name
+        new, old = self._folder / f".{goal.name}.new", self._folder / f".{goal.name}.old"
         try:
             _delete(new)
             new.mkdir(parents=True)
             for name, content in files_of(goal).items():
                 (new / name).write_bytes(content)
-            _delete(place)
-            return new.rename(place)
+            if self.has(goal.name):
+                _delete(old)
+                place.rename(old if goal.name in self.read()[0] else self._aside(goal.name))
+            new.rename(place)
+            _delete(old)
         except OSError as error:
+            self.put_back()
             raise Refused(f"{place}: cannot be written: {error.strerror}") from None
+        return place
 
     def remove(self, name: str) -> None:
         """Deletes a goal; of one that is a link, the link. Raises Refused where the disk does not let go of it."""
         try:
+            _delete(self._folder / f".{name}.old")
             _delete(self._folder / name)
         except OSError as error:
             raise Refused(f"{self._folder / name}: cannot be deleted: {error.strerror}") from None
+
+    def _aside(self, name: str) -> Path:
+        """Where something of that name can be left that is no goal."""
+        names = (f"{name}_unread_{number}" for number in itertools.count(1))
+        return self._folder / next(free for free in names if not self.has(free))
 
 
 def _delete(folder: Path) -> None:

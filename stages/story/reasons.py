@@ -17,7 +17,7 @@ REASONS = {
     "busy": r"busy: waits for [\w' ]+; ask again after the verdict",
     "no_goal": rf"name={_TEXT}: no such goal.*",
     "empty": rf"name={_TEXT}: names no object; .*",
-    "taken": rf"\w+={_TEXT}: there is a goal of that name.*",
+    "taken": rf"\w+={_TEXT}: there is a (?:goal|folder) of that name.*",
     "no_name": rf"\w+={_TEXT}: must consist of letters, digits, - and _ only",
     "too_long": rf"\w+={_TEXT}: must have at most {_NUMBER} bytes as UTF-8",
     "not_written": r".*: cannot be (?:written|deleted): (?P<text>.*)",

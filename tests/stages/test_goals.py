@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import re
+import shutil
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -21,7 +24,7 @@ from stages.messages import Add, Face, Forget, Goal, Kept, Loosen, Rename, Scene
 from stages.planning.symbolic.pddl import goal_pddl
 from stages.planning.symbolic.problem import Problem
 from stages.scene.catalogue import BUILT_IN, Catalogue
-from stages.scene.goals import packed
+from stages.scene.goals import packed, without
 from stages.scene.virtual import satisfied
 from tests.stages.episodes import Recorded, scene
 from tests.stages.story.test_story import frame
@@ -156,6 +159,47 @@ def test_what_the_disk_does_not_take_is_said_and_ends_nothing(tmp_path: Path) ->
     assert robot.kept == Kept(goals=(), faults=(why,)) and robot.ctx.lines == [why]
     with pytest.raises(Refused, match=why):
         robot.called(Add(file=file))
+
+
+def test_what_cannot_be_read_is_never_written_over(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.taught("tea")
+    (tmp_path / "dinner").mkdir()
+    (tmp_path / "dinner" / "goal.pddl").write_text("an hour of work")
+    for place, command in (
+        ("to", Rename(name="tea", to="dinner")),
+        ("name", Add(name="dinner", file=packed(robot.kept.goals[0]))),
+    ):
+        with pytest.raises(Refused, match=rf"{place}='dinner': there is a folder of that name in {tmp_path} that is"):
+            robot.called(command)
+    robot.taught("dinner")
+    assert list(robot.goals()) == ["dinner", "tea"]
+    assert (tmp_path / "dinner_unread_1" / "goal.pddl").read_text() == "an hour of work"
+    (fault,) = robot.kept.faults
+    assert fault.startswith(f"{tmp_path}/dinner_unread_1: goal.pddl: line 1")
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_a_write_that_is_broken_off_loses_no_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    robot, left = Robot(tmp_path), iter(range(steps))
+    robot.taught("tea")
+
+    def breaking(step: Callable[..., object]) -> Callable[..., object]:
+        def taken(*arguments: object) -> object:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return step(*arguments)
+
+        return taken
+
+    with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
+        patch.setattr(Path, "rename", breaking(Path.rename))
+        patch.setattr(shutil, "rmtree", breaking(shutil.rmtree))
+        robot.called(Strike(name="tea", what="cup"))
+    again = Robot(tmp_path)
+    assert again.kept.faults == () and facts(again.scene()) == facts(TEA if steps < 2 else without(TEA, "cup"))
+    again.called(Forget(name="tea"))
+    assert Robot(tmp_path).kept == Kept(goals=())
 
 
 def test_of_a_goal_that_is_a_link_only_the_link_is_deleted(tmp_path: Path) -> None:
