@@ -53,6 +53,7 @@ class Episode:
             "restored_by_truth": judgement.restored,
             "restored_as_claimed": judgement.claimed,
             "false_success": judgement.false_success,
+            "end_seen": judgement.end_seen,
             "objects_lost": len(losses),
             "objects_lost_unsaid": sum(not loss.said for loss in losses),
             "transfers": len(self.outcomes),
@@ -106,11 +107,9 @@ def judged(path: Path, *, seed: int, code: int, seconds: float, reason: str) -> 
     recording = Recording(path)
     verdict = next(iter(messages(recording, Verdict)), None)
     outcomes, corrections = tuple(messages(recording, Outcome)), tuple(messages(recording, Correction))
-    judgement = Judgement(claimed=False)
-    if verdict is not None:
-        goal = next((goal for goal in messages(recording, Goal) if goal.name == verdict.goal_name), None)
-        snapshots = list(messages(recording, Snapshot))
-        judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
+    goals = (goal for goal in messages(recording, Goal) if verdict is None or goal.name == verdict.goal_name)
+    snapshots = list(messages(recording, Snapshot))
+    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, next(goals, None), verdict, outcomes)
     complete = recording.verdict.complete
     return Episode(seed, code, seconds, verdict, judgement, outcomes, complete, reason, path, corrections)
 

@@ -50,7 +50,8 @@ def title(episode: Episode) -> str:
     verdict, judgement = episode.verdict, episode.judgement
     if judgement.false_success:
         broken = ", ".join(map(str, judgement.violated))
-        return f'Goal "{verdict.goal_name}" NOT restored. FALSE SUCCESS: in truth {broken} does not hold'
+        why = f"in truth {broken} does not hold" if broken else "nobody has seen the end"
+        return f'Goal "{verdict.goal_name}" NOT restored. FALSE SUCCESS: {why}'
     if verdict.success:
         return f'Goal "{verdict.goal_name}" restored: {verdict.reason}'
     but = " (in truth every relation holds)" if judgement.restored else ""
@@ -162,7 +163,8 @@ def _truth(judgement: Judgement) -> list[str]:
         return ["no goal was taught"]
     unsaid = sum(not loss.said for loss in judgement.losses)
     lost = f"objects lost or knocked over: {len(judgement.losses)}, {unsaid} of them unsaid"
-    told = [*judgement.differences, *map(str, judgement.losses)]
+    unseen = [] if judgement.end_seen else ["the end was not seen: there is no look after the last transfer"]
+    told = [*unseen, *judgement.differences, *map(str, judgement.losses)]
     return [f"{len(judgement.held)} of {count} hold; {lost}", *(_clip(line, WIDTH - 2) for line in told)]
 
 

@@ -54,11 +54,13 @@ class Judgement:
     losses: tuple[Loss, ...] = ()
     regained: tuple[Assertion, ...] = ()
     """Relations that hold at the end and did not at the start."""
+    end_seen: bool = True
+    """Whether there is a look after the last transfer; if not, the rest is of the last look before it."""
 
     @property
     def restored(self) -> bool:
-        """Whether every relation of the goal holds; never where no goal was taught."""
-        return bool(self.held) and not self.violated
+        """Whether every relation of the goal holds; never where no goal was taught, nor where the end was not seen."""
+        return bool(self.held) and not self.violated and self.end_seen
 
     @property
     def false_success(self) -> bool:
@@ -79,19 +81,24 @@ class Truth:
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def judge(
-        self, snapshots: Sequence[Snapshot], goal: Goal | None, verdict: Verdict, outcomes: Sequence[Outcome]
+        self, snapshots: Sequence[Snapshot], goal: Goal | None, verdict: Verdict | None, outcomes: Sequence[Outcome]
     ) -> Judgement:
-        """The end of an episode; ``snapshots`` are those of its looks, in order."""
-        if goal is None:
-            return Judgement(verdict.success)
-        shown = max(k for k, one in enumerate(snapshots) if _shows(one.purpose, goal.name))
+        """The end of an episode; ``snapshots`` are those of its looks, in order, and perhaps one more of its ``end``.
+
+        Without a verdict, where the run was killed, it claims nothing.
+        """
+        claimed = verdict is not None and verdict.success
+        shows = [k for k, one in enumerate(snapshots) if goal and _shows(one.purpose, goal.name)]
+        if goal is None or not shows:
+            return Judgement(claimed)
+        shown = shows[-1]
         wanted = self._wanted(self._as_taught(snapshots[shown], goal.scene), goal.scene)
         held, violated = self._satisfied(wanted, snapshots[-1])
         lacking = self._satisfied(wanted, snapshots[min(shown + 1, len(snapshots) - 1)])[1]
         return Judgement(
-            verdict.success, held, violated, _differences(held, violated, verdict),
+            claimed, held, violated, _differences(held, violated, verdict) if verdict else (),
             self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes), {one.object for one in outcomes}),
-            tuple(each for each in held if each in lacking),
+            tuple(each for each in held if each in lacking), _end_seen(snapshots[shown:], verdict, outcomes),
         )  # fmt: skip
 
     def _as_taught(self, shown: Snapshot, taught: SceneGraph) -> Snapshot:
@@ -170,6 +177,13 @@ def _shows(purpose: str, name: str) -> bool:
     return purpose.partition(",")[0] in ("goal", f"goal {name}")
 
 
+def _end_seen(snapshots: Sequence[Snapshot], verdict: Verdict | None, outcomes: Sequence[Outcome]) -> bool:
+    """Whether nothing has moved since the last look; without a verdict something may."""
+    looks = {one.purpose.partition(",")[0] for one in snapshots}
+    last = max((one.number for one in outcomes), default=0)
+    return "end" in looks or (verdict is not None and (not last or f"after transfer {last}" in looks))
+
+
 def _table(snapshot: Snapshot, taught: SceneGraph) -> Floats:
     """T_base_table, as it was perceived where the recording is older than the field."""
     return taught.T_base_table if snapshot.T_base_table is None else snapshot.T_base_table
@@ -195,7 +209,7 @@ def _differences(held: Sequence[Assertion], violated: Sequence[Assertion], verdi
     )
 
 
-def _words(verdict: Verdict, outcomes: Sequence[Outcome]) -> set[str]:
+def _words(verdict: Verdict | None, outcomes: Sequence[Outcome]) -> set[str]:
     """The words in which failures were told."""
     failed = [f"{item.object} {item.reason}" for item in outcomes if not item.success]
-    return set(re.findall(r"\w+", " ".join([verdict.reason, *failed])))
+    return set(re.findall(r"\w+", " ".join([verdict.reason if verdict else "", *failed])))

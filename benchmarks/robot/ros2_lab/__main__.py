@@ -31,7 +31,7 @@ from runner.recording.recording import Recording
 from runner.testing import finish, read_until, start_graph
 from stages.messages import Goal, Outcome, Snapshot, Verdict
 from stages.scene.catalogue import BUILT_IN, Catalogue
-from stages.scene.truth import Judgement, Truth
+from stages.scene.truth import Truth
 
 ROOT = Path(__file__).parents[3]
 GOAL = "breakfast"
@@ -147,11 +147,9 @@ def judged(path: Path, layouts: Layouts, *, seed: int, code: int, seconds: float
     recording = Recording(path)
     verdict, goal = ([None, *messages(recording, Verdict)][-1], [None, *messages(recording, Goal)][-1])
     outcomes = tuple(messages(recording, Outcome))
-    judgement = Judgement(claimed=False)
-    if verdict is not None:
-        purposes = (f"goal {GOAL}", f"restore {GOAL}", "end")
-        snapshots = [_snapshot(*one) for one in zip(purposes, layouts, strict=True)]
-        judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
+    purposes = (f"goal {GOAL}", f"restore {GOAL}", "end")
+    snapshots = [_snapshot(*one) for one in zip(purposes, layouts, strict=True)]
+    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
     return Episode(seed, code, seconds, verdict, judgement, outcomes, recording.verdict.complete, reason, path)
 
 

@@ -2,13 +2,17 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from benchmarks.robot import episodes
 from benchmarks.robot.episodes import HEADER, Episode, main, row, totals
-from stages.messages import Assertion, Verdict
+from stages.messages import Assertion, Goal, Snapshot, Verdict
 from stages.scene.truth import Judgement, Loss
 from tests.stages.episodes import outcome, transfer
+from tests.stages.layouts import Layout
+from tests.stages.scene.test_truth import snapshot
 
 HELD, BROKEN = (Assertion(predicate="on", arguments=(name, "table")) for name in ("cup", "mug"))
 
@@ -56,6 +60,17 @@ def test_rows_fit_their_header_and_all_is_counted() -> None:
         "in truth 1, false successes 1, objects lost 2, 2 of them unsaid; "
         "12.2 robot seconds and 31.2 wall seconds per relation regained"
     )
+
+
+def test_what_was_lost_is_counted_where_a_run_was_killed_before_its_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Layout().put("sugar_box", 0.0, 0.0)
+    lies = Layout().put("sugar_box", 0.0, 0.0, resting=1)
+    looks = [snapshot(one, purpose) for one, purpose in ((shown, "goal"), (shown, "start"), (lies, "after transfer 1"))]
+    said = {Snapshot: looks, Goal: [Goal(name="tea", scene=shown.graph(), pddl="")]}
+    monkeypatch.setattr(episodes, "Recording", lambda path: SimpleNamespace(verdict=SimpleNamespace(complete=False)))
+    monkeypatch.setattr(episodes, "messages", lambda _, kind: iter(said.get(kind, ())))
+    found = episodes.judged(Path("killed.mcap"), seed=7, code=-9, seconds=1.0, reason="killed").summary()
+    assert (found["objects_lost"], found["restored_by_truth"], found["end_seen"]) == (1, False, False)
 
 
 def test_an_unknown_suite_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

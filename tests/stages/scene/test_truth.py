@@ -41,7 +41,12 @@ def verdict(taught: Layout, perceived: Layout, reason: str = "") -> Verdict:
 
 
 def judged(
-    final: Layout, said: Verdict, *, taught: Layout = SHOWN, shown: Layout = SHOWN, outcomes: tuple[Outcome, ...] = ()
+    final: Layout,
+    said: Verdict | None,
+    *,
+    taught: Layout = SHOWN,
+    shown: Layout = SHOWN,
+    outcomes: tuple[Outcome, ...] = (),
 ) -> Judgement:
     snapshots = [
         snapshot(shown, "goal"),
@@ -126,6 +131,21 @@ def test_what_lies_as_it_was_shown_was_not_knocked_over() -> None:
 def test_without_a_goal_nothing_was_restored() -> None:
     found = TRUTH.judge([snapshot(START, "goal")], None, verdict(SHOWN, START), ())
     assert not found.restored and not found.false_success
+
+
+def test_what_was_not_looked_at_after_the_last_transfer_is_not_restored() -> None:
+    stopped = (outcome(1, transfer("cup", "table", "tray")), outcome(2, transfer("sugar_box", "table", "table")))
+    found = judged(SHOWN, verdict(SHOWN, SHOWN), outcomes=stopped)
+    assert not found.violated and not found.end_seen and not found.restored and found.false_success
+    assert judged(SHOWN, verdict(SHOWN, SHOWN), outcomes=stopped[:1]).restored
+
+
+def test_what_was_lost_before_a_run_was_killed_is_judged_without_a_verdict() -> None:
+    lying = Layout().put("sugar_box", 0.0, -0.2, resting=1).poses["sugar_box"]
+    found = judged(with_pose(SHOWN, "sugar_box", lying), None)
+    assert [str(loss) for loss in found.losses] == ["sugar_box was knocked over, and nobody said so"]
+    assert not (found.claimed or found.restored or found.false_success or found.differences)
+    assert not judged(SHOWN, None).restored and not TRUTH.judge([], None, None, ()).claimed
 
 
 def test_equal_objects_are_exchangeable_and_taught_under_any_names() -> None:
