@@ -87,7 +87,8 @@ class Episode:
     def judged(self) -> Judgement:
         """By the truth."""
         assert self.verdict is not None
-        return Truth(Catalogue.shared(BUILT_IN)).judge(self.snapshots, self.goal, self.verdict, self.outcomes)
+        began = self.tasks[0].current if self.tasks else None
+        return Truth(Catalogue.shared(BUILT_IN)).judge(self.snapshots, self.goal, self.verdict, self.outcomes, began)
 
 
 class Robot:

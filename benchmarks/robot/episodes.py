@@ -19,11 +19,11 @@ from typing import TypeVar
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from stages.devices.suites import kinds
-from stages.messages import Correction, Goal, Outcome, Snapshot, Verdict
+from stages.messages import Correction, Goal, Outcome, Snapshot, Task, Verdict
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.truth import Judgement, Truth
 
-M = TypeVar("M", Correction, Goal, Outcome, Snapshot, Verdict)
+M = TypeVar("M", Correction, Goal, Outcome, Snapshot, Task, Verdict)
 ROOT = Path(__file__).parents[2]
 SUITES: dict[str, tuple[str, ...]] = {"tray": ()} | {name: (f"world.suite={name}",) for name in kinds.DRAWN}
 """Settings by suite: ``tray`` is what the graph lays out as it stands."""
@@ -109,7 +109,8 @@ def judged(path: Path, *, seed: int, code: int, seconds: float, reason: str) -> 
     outcomes, corrections = tuple(messages(recording, Outcome)), tuple(messages(recording, Correction))
     goals = (goal for goal in messages(recording, Goal) if verdict is None or goal.name == verdict.goal_name)
     snapshots = list(messages(recording, Snapshot))
-    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, next(goals, None), verdict, outcomes)
+    began = next((task.current for task in messages(recording, Task)), None)
+    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, next(goals, None), verdict, outcomes, began)
     complete = recording.verdict.complete
     return Episode(seed, code, seconds, verdict, judgement, outcomes, complete, reason, path, corrections)
 

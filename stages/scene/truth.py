@@ -81,11 +81,17 @@ class Truth:
         self._stances = {label: Stances(item) for label, item in catalogue.objects.items()}
 
     def judge(
-        self, snapshots: Sequence[Snapshot], goal: Goal | None, verdict: Verdict | None, outcomes: Sequence[Outcome]
+        self,
+        snapshots: Sequence[Snapshot],
+        goal: Goal | None,
+        verdict: Verdict | None,
+        outcomes: Sequence[Outcome],
+        began: SceneGraph | None = None,
     ) -> Judgement:
         """The end of an episode; ``snapshots`` are those of its looks, in order, and perhaps one more of its ``end``.
 
-        Without a verdict, where the run was killed, it claims nothing.
+        Without a verdict, where the run was killed, it claims nothing. ``began`` is what the robot perceived when it
+        began to restore; its names are those by which it tells losses. Without, they are taken for those of the goal.
         """
         claimed = verdict is not None and verdict.success
         shows = [k for k, one in enumerate(snapshots) if goal and _shows(one.purpose, goal.name)]
@@ -95,18 +101,30 @@ class Truth:
         wanted = self._wanted(self._as_taught(snapshots[shown], goal.scene), goal.scene)
         held, violated = self._satisfied(wanted, snapshots[-1])
         lacking = self._satisfied(wanted, snapshots[min(shown + 1, len(snapshots) - 1)])[1]
+        perceived = goal.scene if began is None else began
+        named = self._named(snapshots[shown:], perceived, at=0 if began is None else 1)
         return Judgement(
             claimed, held, violated, _differences(held, violated, verdict) if verdict else (),
-            self._losses(snapshots[shown:], goal.scene, _words(verdict, outcomes), {one.object for one in outcomes}),
+            self._losses(named, goal.scene, _words(verdict, outcomes), {one.object for one in outcomes}),
             tuple(each for each in held if each in lacking), _end_seen(snapshots[shown:], verdict, outcomes),
         )  # fmt: skip
 
     def _as_taught(self, shown: Snapshot, taught: SceneGraph) -> Snapshot:
         """Equal objects with the names of those that were perceived where they are."""
-        labels = [label_of(name, self._catalogue) for name in shown.names]
-        matches = matched(shown.names, shown.T_base_objects, taught.objects, self._catalogue)
-        kept = [matches[k].name if k in matches else None for k in range(len(labels))]
-        return msgspec.structs.replace(shown, names=tuple(unique_names(labels, kept)))
+        return self._named([shown], taught, at=0)[0]
+
+    def _named(self, snapshots: Sequence[Snapshot], perceived: SceneGraph, *, at: int) -> list[Snapshot]:
+        """Looks whose objects have the names of those that were perceived where they are at one of them, or the last.
+
+        What was not perceived gets a name that is left.
+        """
+        look = snapshots[min(at, len(snapshots) - 1)]
+        names = list(dict.fromkeys(name for one in (look, *snapshots) for name in one.names))
+        labels = [label_of(name, self._catalogue) for name in names]
+        matches = matched(look.names, look.T_base_objects, perceived.objects, self._catalogue)
+        kept = [matches[k].name if k in matches else None for k in range(len(names))]
+        new = dict(zip(names, unique_names(labels, kept), strict=True))
+        return [msgspec.structs.replace(one, names=tuple(new[name] for name in one.names)) for one in snapshots]
 
     def _satisfied(self, wanted: SceneGraph, snapshot: Snapshot) -> tuple[tuple[Assertion, ...], tuple[Assertion, ...]]:
         """Which of the goal's relations hold at a look and which do not."""

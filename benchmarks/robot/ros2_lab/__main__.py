@@ -29,7 +29,7 @@ from benchmarks.robot.ros2_lab.controllers import Arm, Gripper
 from benchmarks.robot.ros2_lab.wire import Interfaces, Speaker, free_port, open_router
 from runner.recording.recording import Recording
 from runner.testing import finish, read_until, start_graph
-from stages.messages import Goal, Outcome, Snapshot, Verdict
+from stages.messages import Goal, Outcome, Snapshot, Task, Verdict
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.truth import Truth
 
@@ -147,9 +147,10 @@ def judged(path: Path, layouts: Layouts, *, seed: int, code: int, seconds: float
     recording = Recording(path)
     verdict, goal = ([None, *messages(recording, Verdict)][-1], [None, *messages(recording, Goal)][-1])
     outcomes = tuple(messages(recording, Outcome))
+    began = next((task.current for task in messages(recording, Task)), None)
     purposes = (f"goal {GOAL}", f"restore {GOAL}", "end")
     snapshots = [_snapshot(*one) for one in zip(purposes, layouts, strict=True)]
-    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes)
+    judgement = Truth(Catalogue.load(BUILT_IN)).judge(snapshots, goal, verdict, outcomes, began)
     return Episode(seed, code, seconds, verdict, judgement, outcomes, recording.verdict.complete, reason, path)
 
 

@@ -156,6 +156,23 @@ def test_equal_objects_are_exchangeable_and_taught_under_any_names() -> None:
     assert found.restored and found.differences == ()
 
 
+def test_a_loss_is_said_by_the_name_that_the_robot_has_for_it() -> None:
+    names = {"sugar_box": "sugar_box_2", "sugar_box_2": "sugar_box"}
+    shown = Layout().put("sugar_box", 0.0, 0.1).put("sugar_box_2", 0.0, -0.2)
+    start = Layout().put("sugar_box", 0.0, 0.3).put("sugar_box_2", 0.0, -0.2)
+    swapped = Layout({names[name]: T for name, T in start.poses.items()})
+    final = with_pose(start, "sugar_box_2", Layout().put("sugar_box_2", 0.0, -0.2, resting=1).poses["sugar_box_2"])
+
+    def losses(taught: Layout, began: Layout | None, fell: str) -> list[tuple[str, bool]]:
+        looks = [snapshot(one, purpose) for one, purpose in ((shown, "goal"), (start, "start"), (final, "after"))]
+        goal, said = Goal(name="tea", scene=taught.graph(), pddl=""), verdict(taught, start, f"x; knocked over: {fell}")
+        return [(one.name, one.said) for one in TRUTH.judge(looks, goal, said, (), began and began.graph()).losses]
+
+    as_taught = Layout({names[name]: T for name, T in shown.poses.items()})
+    assert losses(as_taught, None, "sugar_box") == losses(shown, swapped, "sugar_box") == [("sugar_box", True)]
+    assert losses(as_taught, None, "sugar_box_2") == losses(shown, swapped, "sugar_box_2") == [("sugar_box", False)]
+
+
 def test_the_only_one_of_its_kind_may_have_been_taught_as_the_second() -> None:
     taught = Layout({{"cup": "cup_2"}.get(name, name): T for name, T in SHOWN.poses.items()})
     found = judged(SHOWN, verdict(taught, taught), taught=taught)
