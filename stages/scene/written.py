@@ -29,7 +29,8 @@ RELATIONS = ("on", "in", "clear", "exist")
 """What a goal may ask for."""
 TYPES = ("item", "region", "label")
 """What its objects may be."""
-_POSE = re.compile(r"^;[ \t]*goal_(\S+)[ \t]+xyz\b(.*)$", re.MULTILINE)
+_POSE = re.compile(r";[ \t]*goal_(\S*)(.*)")
+_NUMBERS = re.compile(r"\s+xyz((?:\s+\S+){3})\s+quaternion_xyzw((?:\s+\S+){4})\s*")
 _FACT = re.compile(r"\(([^()]*)\)")
 
 
@@ -160,6 +161,8 @@ def _facts(plain: str, declared: Collection[str]) -> Iterator[_Fact]:
             raise _refusal(line, found[0], "no relation that a goal may have", _forms(declared))
         if unknown := next((name for name in arguments if name not in (TABLE, *declared)), None):
             raise _refusal(line, unknown, "not among the objects", ", ".join([TABLE, *declared]))
+        if predicate in ("on", "in") and arguments[:1] == [TABLE]:
+            raise _refusal(line, found[0], f"the {TABLE} rests on nothing", _forms(declared))
         yield _Fact(predicate, tuple(arguments), line)
 
 
@@ -178,16 +181,27 @@ def _poses(text: str, items: Sequence[str]) -> dict[str, Floats]:
     """T_base_object of each item of which a comment says it."""
     poses: dict[str, Floats] = {}
     for found in _POSE.finditer(text):
-        xyz, _, quaternion = found[2].partition("quaternion_xyzw")
-        try:
-            R = Rotation.from_quat(np.array(quaternion.split(), np.float64)).as_matrix()
-            poses[found[1]] = pose(R, np.array(xyz.split(), np.float64))
-        except ValueError:
-            poses[found[1]] = np.full((4, 4), np.nan)
-        if found[1] not in items or not np.isfinite(poses[found[1]]).all():
+        item, T, line, said = found[1], _pose(found[2]), _line_at(text, found.start()), found[0].strip()
+        if item not in items or T is None:
             valid = f"; goal_ITEM xyz X Y Z quaternion_xyzw X Y Z W, for each of {', '.join(items)}"
-            raise _refusal(_line_at(text, found.start()), found[0], "no pose of an item", valid)
+            raise _refusal(line, said, "no pose of an item", valid)
+        if item in poses:
+            raise _refusal(line, said, f"a second pose of {item}", "one for each item")
+        poses[item] = T
     return poses
+
+
+def _pose(text: str) -> Floats | None:
+    """What stands behind an item in the comment that says its pose; None where that is none."""
+    found = _NUMBERS.fullmatch(text)
+    if found is None:
+        return None
+    try:
+        xyz, quaternion = (np.array(part.split(), np.float64) for part in found.groups())
+        T = pose(Rotation.from_quat(quaternion).as_matrix(), xyz)
+    except ValueError:  # no number, or no rotation
+        return None
+    return T if np.isfinite(T).all() else None
 
 
 # ------------------------------------------------------------------------------------------------- what it means

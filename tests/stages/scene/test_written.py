@@ -123,6 +123,36 @@ OBJECTS = "table, cup, tray, tea_box"
 VALID = rf"valid: \(on A B\), \(in A B\), \(clear A\), \(exist A\) of {OBJECTS}"
 
 
+POSE = "goal_tray xyz 0.6 -0.2 0.7 quaternion_xyzw 0 0 0 1"
+
+
+@pytest.mark.parametrize("init", [f"; {POSE}\n(:init)", f"  \t;;;{POSE}\n(:init)", f"(:init) ; the tray ; {POSE}\r\n"])
+def test_a_place_may_stand_wherever_a_comment_may(init: str) -> None:
+    goal = read(TEA.replace("  (:init)", init))
+    (tray,) = (item for item in goal.objects if item.name == "tray")
+    assert not tray.anywhere and np.allclose(tray.T_base_object[:3, 3], [0.6, -0.2, 0.7])
+
+
+@pytest.mark.parametrize(
+    "comment",
+    [
+        *("; goal_tray xyz 0.5 quaternion_xyzw 0 0 0 1", "; goal_tray 0.6 -0.2 0.7 quaternion_xyzw 0 0 0 1"),
+        *("; goal_tray xyz 0.6 -0.2 0.7", "; goal_tray xyz 0.6 -0.2 0.7 quaternion_xyzw 0 0 0 1 0", "; goal_"),
+        *("; goal_tray xyz 0.6 -0.2 high quaternion_xyzw 0 0 0 1", "; goal_fork xyz 0 0 0 quaternion_xyzw 0 0 0 1"),
+        *("; goal_tray xyz 0.6 -0.2 nan quaternion_xyzw 0 0 0 1", "; goal_tray xyz 0 0 0 quaternion_xyzw 0 0 0 0"),
+    ],
+)
+def test_a_place_that_is_none_is_refused_wherever_it_stands(comment: str) -> None:
+    form = r"no pose of an item; valid: ; goal_ITEM xyz X Y Z quaternion_xyzw X Y Z W, for each of cup, tray, tea_box"
+    with pytest.raises(Refused, match=rf"line 7: '{comment}': {form}"):
+        read(TEA.replace("(on tray table)", f"(on tray table) {comment}"))
+
+
+def test_an_item_has_one_place() -> None:
+    with pytest.raises(Refused, match=f"line 2: '; {POSE}': a second pose of tray; valid: one for each item"):
+        read(f"; {POSE}\n; {POSE}\n{TEA}")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "refused"),
     [
@@ -138,8 +168,9 @@ VALID = rf"valid: \(on A B\), \(in A B\), \(clear A\), \(exist A\) of {OBJECTS}"
         (
             "(on tray table)",
             "(on table tray)",
-            rf"line 7: '\(on table tray\)': .*not well-formed.*; {VALID}",
+            rf"line 7: '\(on table tray\)': the table rests on nothing; {VALID}",
         ),
+        ("(on tray table)", "(in table tray)", r"line 7: '\(in table tray\)': the table rests on nothing"),
         ("(clear tea_box)", "(clear tea_box cup)", rf"line 8: '\(clear tea_box cup\).*arity 1.*; {VALID}"),
         ("(clear tea_box)", "(on cup table)", r"line 8: '\(on cup table\)': contradicts \(in cup tray\) on line 6"),
         ("(clear tea_box)", "(clear tray)", r"line 8: '\(clear tray\)': contradicts \(in cup tray\) on line 6"),
