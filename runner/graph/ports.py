@@ -87,7 +87,8 @@ def inspect_stage(cls: type[Stage]) -> StageType:
     emitted = [kind for name in methods for kind in _message_types(_hints(cls, name)["return"])]
     refuse_shared(cls.__name__, ((port_name(kind), f"{kind.__module__}:{kind.__qualname__}") for kind in emitted))
     for kind in (*emitted, *(port.type for handler in handlers for port in handler.inputs)):
-        _refuse_sets(f"{cls.__name__}: {kind.__name__}", kind, set())
+        if reason := _why_no_message(kind):
+            raise Refused(f"{cls.__name__}: {reason}")
     outputs = {port_name(kind): kind for kind in emitted}
     return StageType(cls, handlers, source, outputs, _config_type(cls))
 
@@ -166,6 +167,16 @@ def _refuse_inputs(cls: type[Stage], method: str, inputs: list[InputPort]) -> No
     for port in inputs:  # nothing else hangs on a command: a join with one would wait for ever
         if issubclass(port.type, Command) and len(inputs) > 1:
             raise Refused(f"{cls.__name__}.{method}({port.name}): a command is the only message its handler takes")
+
+
+@cache
+def _why_no_message(kind: type[Message]) -> str:
+    """Why a type cannot be sent; empty where it can. Many stages have the same types."""
+    try:
+        _refuse_sets(kind.__name__, kind, set())
+    except Refused as refusal:
+        return str(refusal)
+    return ""
 
 
 def _refuse_sets(place: str, annotation: Any, known: set[Any]) -> None:

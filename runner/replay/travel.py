@@ -26,7 +26,7 @@ from runner.message.codec import Envelope, Step
 from runner.message.ids import MessageId
 from runner.message.packet import Process
 from runner.process.step import arguments_of
-from runner.recording.recording import Recording, opened, replicated
+from runner.recording.recording import Recording, kind_of, opened, replicated
 from runner.replay.expression import Expression
 from runner.replay.replay import change
 from runner.replay.tasks import HEADER, Execution, Reexecution, Task, process_of, steps_of, what_differs
@@ -172,8 +172,8 @@ class Traveller:
         if sealed is None:
             yield "recorded, and not emitted in the replay"
             return
-        one = MessageId.of(sealed.id)
-        kind = self._graph.outputs_of(one.stage)[one.port]
+        kind = kind_of(self._graph, sealed.id)
+        assert kind is not None  # It has just been emitted.
         if (other := what_differs(recorded, sealed, kind)) is None:
             yield "executed again: identical to the recording"
         else:

@@ -16,7 +16,7 @@ from runner.inspect.info import table
 from runner.inspect.summary import Summary
 from runner.message.codec import Envelope
 from runner.message.ids import MessageId
-from runner.recording.recording import Recording, opened
+from runner.recording.recording import Recording, kind_of, opened
 from runner.replay.partial import PartialReplay
 from runner.replay.replay import change
 from runner.replay.tasks import HEADER, what_differs
@@ -111,12 +111,12 @@ def effects_of(
         if id not in emitted:
             effects["vanished"].append(id)
             continue
-        before, one = recording.envelope(id), MessageId.of(id)
-        kind = graph.outputs_of(one.stage)[one.port]
+        before, kind = recording.envelope(id), kind_of(graph, id)
+        assert kind is not None  # It has just been emitted.
         now = what_differs(before, emitted[id], kind)
         effects["identical" if now is None else "changed"].append(id)
         found = () if now is None else envelope_differences(before, now, HEADER, kind)
-        summary.add(one.topic, id, found)
+        summary.add(MessageId.of(id).topic, id, found)
     effects["appeared"] += (id for id in emitted if id not in recording.messages)
     return effects, summary
 

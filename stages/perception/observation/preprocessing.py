@@ -27,8 +27,8 @@ def preprocess(
         Refused: there are hardly any readings, or no plane among them.
     """
     measured = np.isfinite(frame.depth) & (frame.depth > 0)
-    area = working_area(frame, candidates)
-    depth = np.where(area & measured, frame.depth, np.float32(0))
+    area, whole = working_area(frame, candidates), _without_robot(frame, measured)
+    depth = np.where(area, whole, np.float32(0))
     view = View.of(frame.K, depth.shape[1], depth.shape[0])
     up = None if frame.T_base_camera is None else frame.T_base_camera[2, :3]
     T_camera_table = find_plane(depth, view, rng, objects=_spheres(depth, view, _surest(candidates)), up=up)
@@ -36,7 +36,6 @@ def preprocess(
         raise Refused(_no_plane(frame, depth))
     height = height_above(depth, view, T_camera_table)
     foreground = (depth > 0) & stands_out(height, depth) & (height < max_height)
-    whole = _without_robot(frame, measured)
     return Observation(
         depth=depth,
         rgb=frame.rgb,
