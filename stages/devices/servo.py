@@ -52,6 +52,8 @@ class Servo:
         )
         self._hand = model.body(robot.gripper.link).id
         self._efforts = Efforts(robot, tuple(robot.posture), balanced=True)
+        self._unladen = np.zeros(model.nu)
+        """What each actuator did before the fingers last moved: fingers that close may bear a thing already."""
         self._asked = False
         self.error = 0.0
         """Largest joint error of the newest command, radians."""
@@ -101,7 +103,9 @@ class Servo:
         arm = np.array([self._robot.body.turns(name) for name in command.joint_names])
         data = self._data
         # The weight of the arm itself is carried: one that stands and touches nothing takes no effort.
-        taken, felt = efforts + data.actuator_force[actuators], np.zeros(len(actuators))
+        lifts = command.guard is not None and command.guard.load > 0
+        standing = self._unladen if lifts else data.actuator_force
+        taken, felt = efforts + standing[actuators], np.zeros(len(actuators))
         for k in range(len(targets)):
             data.ctrl[actuators] = commanded[k]
             self._step()
@@ -120,7 +124,7 @@ class Servo:
 
     def _grip(self, width: float) -> Iterator[None]:
         """The fingers stall with limited force at what is between them."""
-        gripper = self._robot.gripper
+        gripper, self._unladen = self._robot.gripper, self._data.actuator_force.copy()
         start, end = self._data.ctrl[self.fingers].copy(), self.grip(width)
         stroke = np.abs(self.grip(gripper.open_width) - self.grip(gripper.closed_width)).max()
         pieces = int(np.ceil(np.abs(end - start).max() / stroke * _STROKE / PIECE))

@@ -31,7 +31,8 @@ class Guard(Struct, frozen=True, kw_only=True):
     error: float = 0.05
     """Radians (metres) by which a joint may be where it was not commanded to be."""
     load: float = 0.0
-    """Newtons that must have been felt from outside by the time that what is lifted is borne."""
+    """Newtons that must have been felt from outside, since the fingers last moved, by the time that what is lifted is
+    borne."""
 
     def broken(self, *, opening: float, force: float, error: float, seconds: float = 0.0) -> tuple[Stopped, str] | None:
         """Which of it does not hold for what is measured, ``seconds`` after the motion began, and what that is; None
