@@ -229,7 +229,8 @@ class Guardian:
     def restart(self, name: str, ended: Callable[[], bool]) -> str:
         """Asks one process to finish and waits for its successor; returns what to tell the user.
 
-        Raises Refused where there is no such process, or the graph has ``ended`` meanwhile.
+        Raises Refused where there is no such process, it would forget what it knows, or the graph has ``ended``
+        meanwhile.
         """
         found = {self._run.name_of(Process(*key)): key for key in self._graph.processes()}
         if name not in found:
@@ -237,6 +238,8 @@ class Guardian:
         old = self._children.get(found[name])
         if old is None or old.process not in self._ready:
             raise Refused(f"{name} is not ready yet")
+        if self._run.forgets(old.process.stage):
+            raise Refused(f"{name} would forget what it knows: no messages are recorded (--steps-only)")
         old.retires_by = time.monotonic() + RETIRE_SECONDS
         old.handle.send_signal(signal.SIGUSR1)
         while (new := self._children[found[name]]) is old or new.process not in self._ready:
@@ -311,9 +314,7 @@ class Guardian:
             self._give_up(child, ASKED)
             return None
         absent = process.place in self._absent()
-        # What a stage remembers is rebuilt from recorded messages, if there are any.
-        forgets = self._run.steps_only and self._run.remembers(process.stage)
-        budget = 0 if forgets else self._graph.nodes[process.stage].restarts
+        budget = 0 if self._run.forgets(process.stage) else self._graph.nodes[process.stage].restarts
         if absent or child.crashes >= budget:
             self._show_output(child)
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")

@@ -58,6 +58,10 @@ class Run:
         kind = self.graph.nodes[stage].type.cls
         return kind.stateful and not kind.device
 
+    def forgets(self, stage: str) -> bool:
+        """Whether a successor cannot learn it, for no messages are recorded."""
+        return self.steps_only and self.remembers(stage)
+
 
 class Launcher:
     """Starts single processes of one run, here or on the host that the graph names."""

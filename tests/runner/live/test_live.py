@@ -34,7 +34,7 @@ from runner.supervise.registry import Entry, Registration, find_run, runs
 from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
 from runner.transport.session import new_endpoint, runtime_folder
-from tests.runner.common.runs import ACCOUNT, TOYS, changed, finish, processes_of
+from tests.runner.common.runs import ACCOUNT, DOUBLES, TOYS, changed, finish, processes_of
 from tests.runner.common.runs import Run as Finished
 from tests.runner.common.toys import Sum
 from tests.runner.common.waiting import wait_until
@@ -43,9 +43,9 @@ from tests.runner.common.waiting import wait_until
 class Run:
     """A running graph and its entry in the list of runs."""
 
-    def __init__(self, folder: Path, graph: Path, *settings: str) -> None:
+    def __init__(self, folder: Path, graph: Path, *settings: str, options: tuple[str, ...] = ()) -> None:
         self.folder = folder
-        self.process = start_graph(graph, *settings, folder=folder)
+        self.process = start_graph(graph, *settings, folder=folder, options=options)
         self.printed = read_until(self.process, "processes are ready")
         self.entry = next(entry for entry in runs() if Path(entry.recording).parent == folder)
 
@@ -356,6 +356,17 @@ def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) ->
     assert {step.outcome for step in steps if step.replica == 1 and step.incarnation == 0} == {"done"}
     pieces = [id for step in steps for port, id in step.consumed if port == "piece"]
     assert len(pieces) == len(set(pieces)) == 240
+
+
+def test_a_stage_that_would_forget_is_not_restarted(tmp_path: Path) -> None:
+    settings = (f"sink.path={tmp_path / 'out.txt'}", f"doubler.marks={tmp_path}", f"counter.go={tmp_path / 'go'}")
+    graph = changed(DOUBLES, tmp_path, Counter="GatedCounter", Doubler="Adder")
+    run = Run(tmp_path, graph, *settings, options=("--steps-only",))
+    with Live(run.entry) as live, pytest.raises(Refused, match=r"^doubler would forget what it knows: "):
+        live.restart("doubler")
+    (tmp_path / "go").touch()
+    finished = run.finish()
+    assert (finished.code, len(finished.result)) == (0, 5), finished.output
 
 
 def test_parts_that_are_done_while_their_publisher_is_replaced_block_no_replica(tmp_path: Path) -> None:
