@@ -230,11 +230,11 @@ class Supervisor:
         with self._numbering:
             self._stopping.set()
             self._numbering.wait_for(lambda: not self._publishing, RECORDED_SECONDS)
-        self._calls.close()
         self._bus.publish(f"e/{self._own.path}", b"")
         self._guardian.end()
         self._journal((), "ended")
         self._has_ended.wait(RECORDED_SECONDS)
+        self._calls.close()  # the last steps of all have been noted
         verdict = self._guardian.end_recorder()
         self._gateway.close()
         self._bus.close()

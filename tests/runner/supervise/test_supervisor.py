@@ -1,22 +1,45 @@
-"""What the supervisor does while one of its links stands still."""
+"""What the supervisor does at the end, also while one of its links stands still."""
 
 import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from runner.contract import Restarted
 from runner.graph.ports import port_name
 from runner.graph.reading import load_graph
+from runner.message.codec import Step
+from runner.supervise.calls import CallQuestion, CallRequest, Calls
 from runner.supervise.supervisor import Supervisor
 from runner.terminal import Terminal
-from tests.runner.common.runs import TOYS
+from tests.runner.common.runs import ACCOUNT, TOYS
+
+
+def supervisor_of(file: Path, folder: Path, *settings: str) -> Any:
+    forks = cast("Any", SimpleNamespace(close=lambda: None))
+    graph = load_graph(file, settings)
+    return Supervisor(graph, file=file, recordings=folder, settings=(), terminal=Terminal(), forks=forks)
+
+
+def test_a_call_that_ends_the_graph_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("runner.supervise.calls.PATIENCE_SECONDS", 0)
+    supervisor, id = supervisor_of(ACCOUNT, tmp_path), "supervisor.account_add#0"
+    calls = supervisor._calls = Calls(load_graph(ACCOUNT), lambda port, command, say: say(id) or id)
+    calls.call(CallRequest("account", "add", {"amount": "1"}))
+
+    def end() -> None:
+        assert not calls.progress(CallQuestion(id, 0)).done
+        calls.note_step(Step("account", 0, 0, 0, "on_add", (("add", id),), ("account.sum#0",), 1, 0, 0, 0))
+
+    supervisor._guardian.end = end
+    supervisor._stop()
+    assert calls.progress(CallQuestion(id, 0)).emitted == ("account.sum#0",)
 
 
 def test_the_end_does_not_wait_for_a_step_that_cannot_be_sent(tmp_path: Path):
-    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
-    forks = cast("Any", SimpleNamespace(close=lambda: None))
-    supervisor: Any = Supervisor(graph, file=TOYS, recordings=tmp_path, settings=(), terminal=Terminal(), forks=forks)
+    supervisor = supervisor_of(TOYS, tmp_path, f"sink.path={tmp_path / 'out.txt'}")
     publish, sends, goes_on, ends = supervisor._bus.publish, *(threading.Event() for _ in range(3))
 
     def publish_slowly(path: str, *more: Any) -> None:
