@@ -122,7 +122,7 @@ class Launcher:
         node = run.graph.nodes[process.stage]
         consumed = [
             (port, id)
-            for replica, port, id in progress.consumed
+            for replica, port, id in list(progress.consumed)  # to which another thread adds
             if replica == process.replica or (port in node.inputs and node.shares(port))
         ]
         has_past = process.incarnation > 0 and run.remembers(process.stage)
@@ -137,7 +137,7 @@ class Launcher:
             processes=tuple(run.graph.processes()),
             replica=process.replica,
             incarnation=process.incarnation,
-            numbers=progress.numbers,
+            numbers=dict(progress.numbers),
             started=progress.started,
             consumed=tuple(consumed[-RESENT:]),
             gateway=run.gateway,
