@@ -144,6 +144,8 @@ class CaughtUp(msgspec.Struct, frozen=True):
     undone: tuple[tuple[str, str, IdText], ...] = ()
     """(consumer, port, message id) of the parts that earlier processes of the stage have sent and nobody has done
     with."""
+    numbers: dict[str, int] = {}
+    """Next sequence number, by output port, after what they have sent in steps that were never done."""
 
 
 class LogLine(msgspec.Struct, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from typing import Annotated, TypeVar
 
 import msgspec
@@ -37,6 +38,12 @@ class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
 
     def __str__(self) -> str:
         return f"{self.stage}.{self.port}#{self.sequence}"
+
+
+def number_on(numbers: dict[str, int], ids: Iterable[str]) -> None:
+    """Has the next sequence numbers, by port, go on after the ids of one stage."""
+    for one in map(MessageId.of, ids):
+        numbers[one.port] = max(numbers.get(one.port, 0), one.sequence + 1)
 
 
 class Recent(OrderedDict[K, V]):

@@ -189,7 +189,8 @@ class Recorder:
         with self._changing:
             del self._lagging[process]
         self._redelivery.catch_up(process)
-        self._say(f"ready/{process.path}", pack(CaughtUp(tuple(self._redelivery.undone(process.stage)))))
+        undone, numbers = tuple(self._redelivery.undone(process.stage)), self._redelivery.numbers(process.stage)
+        self._say(f"ready/{process.path}", pack(CaughtUp(undone, numbers)))
 
     def _on_message(self, envelope: Envelope, packet: Packet) -> None:
         topic = packet.key.partition("/")[2]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from runner.graph.graph import Route
 from runner.message.codec import Envelope, Step, answered
-from runner.message.ids import Recent
+from runner.message.ids import Recent, number_on
 from runner.message.packet import Process
 
 LATEST_SECONDS = 0.5
@@ -133,6 +133,12 @@ class Redelivery:
             if topic.partition("/")[0] == stage:
                 for (consumer, _, port), waiting in edges.items():
                     yield from ((consumer, port, id) for id in waiting.messages if waiting.route.shared)
+
+    def numbers(self, stage: str) -> dict[str, int]:
+        """Next sequence number, by output port, after what a stage has sent in steps that were never done."""
+        numbers: dict[str, int] = {}
+        number_on(numbers, self._open.get(stage, {}))
+        return numbers
 
     def lost(self, process: Process, living: Iterable[Process]) -> None:
         """Sends what a dead process has published, and nobody has done with, to those who may not have got it."""

@@ -195,6 +195,8 @@ class StageProcess:
 
     def _on_caught_up(self, caught_up: CaughtUp, _: Packet) -> None:
         self._delivery.take_over(caught_up.undone)
+        if self._node.type.cls.device and self._intake.is_behind:  # what it does again is another thing in the world
+            self._executor.number_on(caught_up.numbers)
         self._intake.caught_up()
 
     def _on_lost(self, lost: Lost, _: Packet) -> None:

@@ -83,6 +83,11 @@ class Executor:
         self._log = log
         self._numbers = dict(numbers or {})
 
+    def number_on(self, numbers: Mapping[str, int]) -> None:
+        """Leaves out the sequence numbers below these, by output port."""
+        for port, number in numbers.items():
+            self._numbers[port] = max(self._numbers.get(port, 0), number)
+
     def run(self, handler: Handler, arrivals: Sequence[Arrival], time_ns: int) -> Iterator[Envelope]:
         """Calls a handler as :meth:`drafts` does and yields what it emits in envelopes."""
         for draft in self.drafts(handler, arrivals, time_ns):

@@ -8,7 +8,7 @@ from runner.graph.graph import Limits
 from runner.hosts.head import RemoteChild
 from runner.inspect.info import byte_count
 from runner.message.codec import Pulse, Step, answered
-from runner.message.ids import MessageId, Recent
+from runner.message.ids import Recent, number_on
 from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, oom_kills
@@ -78,6 +78,4 @@ class Progress:
             return
         self.done += 1
         self.started |= not step.consumed
-        for id in step.emitted:
-            one = MessageId.of(id)
-            self.numbers[one.port] = max(self.numbers.get(one.port, 0), one.sequence + 1)
+        number_on(self.numbers, step.emitted)

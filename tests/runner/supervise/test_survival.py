@@ -160,6 +160,17 @@ def test_a_stage_that_remembers_gets_its_memory_back(tmp_path: Path):
     assert code == 0, said
 
 
+def test_what_a_device_does_again_has_ids_of_its_own(tmp_path: Path):
+    settings = ("counter.restarts=1", f"counter.taken={tmp_path / 'out.txt'}", "sink.count=6")
+    ended = run(changed(DOUBLES, tmp_path, Counter="Starter"), tmp_path, *settings)
+    assert (ended.code, ended.result) == (0, ["0", "2", "4", "20", "22", "24"]), ended.output
+    recording = Recording(ended.recording)
+    assert recording.verdict.complete, recording.verdict
+    assert [id for id in recording.messages if "counter" in id] == [f"counter.number#{number}" for number in range(6)]
+    code, said = verify(ended.recording)
+    assert code == 0, said
+
+
 DIES_WITH_ANOTHER = """
   other:
     stage: tests.runner.common.survivors:DiesWithAnother
