@@ -1,6 +1,7 @@
 """Proves from the records of a recording, one by one in the order of the file, that nothing is missing."""
 
 import itertools
+import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 
 from runner.graph.graph import SUPERVISOR, command_port
-from runner.message.codec import LogLine, Lost, Step
+from runner.message.codec import Envelope, LogLine, Lost, Step
 from runner.recording.intervals import Intervals
 
 Record = str | Step | Lost | LogLine
@@ -87,6 +88,10 @@ class Proof:
         """Named by a step and not recorded, or not yet."""
         self._excused = defaultdict[str, Intervals](Intervals)
         """Recorded, and emitted by no step before a process of the stage was lost."""
+        self._contents: dict[str, int] = {}
+        """Checksums, by id, of the messages that may come again: no step has emitted them yet."""
+        self._ambiguous: dict[str, None] = {}
+        """Ids of those that came again as something else."""
         self._newest_ns = -1
         self._misplaced = 0
         """Records that do not follow the one before them in time, and the first of them:"""
@@ -96,15 +101,15 @@ class Proof:
 
     # ------------------------------------------------------------------------------------ what is entered
 
-    def enter(self, topic: str, log_time_ns: int, record: Record) -> None:
-        """The next record of the file."""
+    def enter(self, topic: str, log_time_ns: int, record: Record, content: int = 0) -> None:
+        """The next record of the file, see :func:`to_enter`."""
         if log_time_ns <= self._newest_ns:
             self._misplaced += 1
             self._disorder += [_name(topic, record)] if self._misplaced <= FEW else []
         self._newest_ns = max(log_time_ns, self._newest_ns)
         match record:
             case str():
-                self.message(record)
+                self.message(record, content)
             case Step():
                 self.step(record)
             case Lost():
@@ -131,9 +136,13 @@ class Proof:
         """A message that should be recorded."""
         self._want(*_numbered(id))
 
-    def message(self, id: str) -> None:
+    def message(self, id: str, content: int = 0) -> None:
         """A recorded message."""
         port, number = _numbered(id)
+        if number not in self._emitted[port]:
+            self._contents.setdefault(id, content)
+        if self._contents.get(id, content) != content:
+            self._ambiguous[id] = None
         recorded = self._recorded[port]
         recorded.add(number)
         if port in self._awaited:
@@ -151,6 +160,8 @@ class Proof:
             port, number = _numbered(id)
             self._emitted[port].add(number)
             self._want(port, number)
+            if step.outcome != "failed":
+                self._contents.pop(id, None)
         for input, id in step.consumed:
             port, number = _numbered(id)
             self._take(step, input, port, number)
@@ -213,6 +224,7 @@ class Proof:
         if self._misplaced:
             more = f" and {self._misplaced - FEW} more" if self._misplaced > FEW else ""
             yield f"out of order: {', '.join(self._disorder)}{more}"
+        yield from (f"two messages have the id {id}" for id in self._ambiguous)
         yield from self._process_problems()
         yield from self._message_problems()
 
@@ -249,6 +261,11 @@ class Proof:
         replicas = range(self._stages[stage].replicas) if replica is None else (replica,)
         each = [self._processes[stage, one] for one in replicas]
         return any(incarnations[max(incarnations)].lost for incarnations in each if incarnations)
+
+
+def to_enter(record: Envelope | Step | Lost | LogLine) -> tuple[Record, int]:
+    """What is recorded, and of a message a checksum of what it says."""
+    return (record.id, zlib.crc32(record.body)) if isinstance(record, Envelope) else (record, 0)
 
 
 def in_short(problems: Iterable[str]) -> str:

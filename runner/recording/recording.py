@@ -20,7 +20,7 @@ from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open
 from runner.message.ids import IdText, MessageId
 from runner.recording.container import Container, Entry, open_file
 from runner.recording.migrations import migrated, migrations_of
-from runner.recording.proof import Proof, Record, in_short
+from runner.recording.proof import Proof, Record, in_short, to_enter
 from runner.recording.provenance import fingerprint, numerical
 from runner.terminal import listed
 
@@ -152,8 +152,8 @@ class Recording:
         self.repeated: set[str] = set()
         """Ids recorded more than once: a restarted stage answers again under the same id."""
         self._open = lru_cache(OPEN_CHUNKS)(self._envelopes_at)
-        self._order: list[tuple[str, int, Record]] = []
-        """Topic, log time and record of all entries in the order of the file."""
+        self._order: list[tuple[str, int, Record, int]] = []
+        """Topic, log time, record and checksum of all entries in the order of the file."""
         self._misplaced: dict[str, None] = {}
         """Findings: metadata that does not stand where it was written."""
         with open_file(path) as file:
@@ -265,7 +265,7 @@ class Recording:
                 self.messages.setdefault(id, located)
         if VERDICT in self.metadata:
             self._misplaced[f"metadata {VERDICT!r} does not stand last"] = None
-        self._order.append((entry.topic, time_ns, record.id if isinstance(record, Envelope) else record))
+        self._order.append((entry.topic, time_ns, *to_enter(record)))
 
     def _envelopes_at(self, offset: int) -> dict[str, Envelope]:
         envelopes: dict[str, Envelope] = {}
@@ -315,7 +315,7 @@ class Recording:
         """Whether it says how processes ended, which the first recordings did not."""
         if "format" in self.run or "counts" in self.metadata.get(VERDICT, {}) or self.lost:
             return True
-        return any(isinstance(record, Step) and record.outcome == "ended" for *_, record in self._order)
+        return any(isinstance(record, Step) and record.outcome == "ended" for _, _, record, _ in self._order)
 
     def _prove(self) -> Proof:
         proof = Proof(self.graph)

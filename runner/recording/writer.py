@@ -30,7 +30,7 @@ from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, json
 from runner.message.ids import MessageId
 from runner.recording import provenance
 from runner.recording.container import Container, hold, message_head
-from runner.recording.proof import Proof, Record, in_short
+from runner.recording.proof import Proof, Record, in_short, to_enter
 from runner.recording.recording import (
     FORMAT,
     JOURNAL,
@@ -284,18 +284,18 @@ class RecordingWriter:
         """Reads back what was written since the last time; what is not there has been dropped."""
         found = list(self._read_back(end))
         with self._proving:
-            for topic, log_time_ns, record in found:
-                self._proof.enter(topic, log_time_ns, record)
+            for topic, log_time_ns, record, content in found:
+                self._proof.enter(topic, log_time_ns, record, content)
                 self._unproved.pop(log_time_ns, None)
         self._drop_unproved()
         self._proved = end
 
-    def _read_back(self, end: int) -> Iterator[tuple[str, int, Record]]:
+    def _read_back(self, end: int) -> Iterator[tuple[str, int, Record, int]]:
         with self._path.open("rb") as file:
             for entry in self._container.entries_at(file, self._proved, end):
                 with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
                     record = unpack(payload_kind(entry.topic), entry.message.data)
-                    yield entry.topic, entry.message.log_time, record.id if isinstance(record, Envelope) else record
+                    yield entry.topic, entry.message.log_time, *to_enter(record)
 
     def _write_verdict(self) -> None:
         self._flush()

@@ -180,6 +180,18 @@ def test_numbers_of_messages_have_no_gaps_except_where_replicas_answer_parts():
     assert prove("camera.depth#2", "filter.pose#2", *emits, *rest) == ([], ("camera.depth#0", "camera.depth#1"))
 
 
+def test_two_messages_of_one_id_are_named():
+    def found(*contents: int) -> list[str]:
+        proof = Proof(GRAPH)
+        for time_ns, content in enumerate(contents):
+            proof.enter("camera/frame", time_ns, "camera.frame#0", content)
+            proof.step(step("camera/0/0", time_ns, emitted="camera.frame#0", outcome="failed"))
+        return [problem for problem in proof.problems() if "two messages" in problem]
+
+    assert found(1, 1) == []
+    assert found(1, 2) == ["two messages have the id camera.frame#0"]
+
+
 def test_every_topic_has_as_many_records_as_came():
     proof = Proof(GRAPH)
     for time_ns, one in enumerate(ended()):

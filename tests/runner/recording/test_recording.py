@@ -181,6 +181,15 @@ def test_a_message_that_came_twice_is_counted_once(tmp_path: Path):
     assert recording.repeated == {"counter.number#0"}
 
 
+def test_two_messages_of_one_id_make_it_incomplete(tmp_path: Path):
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    records = list(ToyRun(graph, tmp_path).records())
+    other = envelope(Number(value=9), id="counter.number#0", lineage="counter.number#0", time_ns=1, causes=())
+    path, verdict = record(graph, tmp_path / "two.mcap", [other, *records])
+    assert str(verdict) == "INCOMPLETE: two messages have the id counter.number#0"
+    assert Recording(path).verdict == verdict
+
+
 def test_a_full_disk_ends_the_recording_and_not_the_process(tmp_path: Path):
     refused: list[str] = []
     recorder = writer(tmp_path / "full.mcap", refused)
