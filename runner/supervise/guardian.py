@@ -40,7 +40,7 @@ UNENDING_SECONDS = 15.0
 SETTLE_SECONDS = 30.0
 """How long a successor waits at most for the recorder's word that it has all that the dead process has sent."""
 RETIRE_SECONDS = 30.0
-"""What a process that is asked to restart may take for its present step; a killed step is done again."""
+"""What a process that is asked to restart may take for its step; then it is killed, unless it is a device."""
 ASKED = "asked to restart"
 SHOWN_LINES = 16
 
@@ -229,8 +229,8 @@ class Guardian:
     def restart(self, name: str, ended: Callable[[], bool]) -> str:
         """Asks one process to finish and waits for its successor; returns what to tell the user.
 
-        Raises Refused where there is no such process, it would forget what it knows, or the graph has ``ended``
-        meanwhile.
+        Raises Refused where there is no such process, it would forget what it knows, a device takes too long for its
+        step, or the graph has ``ended`` meanwhile.
         """
         found = {self._run.name_of(Process(*key)): key for key in self._graph.processes()}
         if name not in found:
@@ -240,11 +240,14 @@ class Guardian:
             raise Refused(f"{name} is not ready yet")
         if self._run.forgets(old.process.stage):
             raise Refused(f"{name} would forget what it knows: no messages are recorded (--steps-only)")
-        old.retires_by = time.monotonic() + RETIRE_SECONDS
+        deadline, device = time.monotonic() + RETIRE_SECONDS, self._graph.nodes[old.process.stage].type.cls.device
+        old.retires_by = float("inf") if device else deadline
         old.handle.send_signal(signal.SIGUSR1)
         while (new := self._children[found[name]]) is old or new.process not in self._ready:
             if ended():
                 raise Refused(f"the graph ended before {name} was back")
+            if device and old.handle.poll() is None and time.monotonic() > deadline:
+                raise Refused(f"{name} is a device, whose step is not cut off; it restarts once that is done")
             time.sleep(TICK_SECONDS)
         return f"{name} is back: process {new.handle.pid}, ready after {self._ready[new.process]:.1f} s"
 
@@ -309,7 +312,8 @@ class Guardian:
         reason = child.reason(self.pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
             return End(EXIT_REFUSED, f"{name}: {reason}")
-        if child.retires_by is not None and not child.killed_because:
+        retires = child.retires_by is not None and (child.handle.returncode == 0 or time.monotonic() > child.retires_by)
+        if retires and not child.killed_because:
             self._say(f"{name} was {ASKED}", "info")
             self._give_up(child, ASKED)
             return None

@@ -1,5 +1,6 @@
 """What the supervisor does at the end, also while one of its links stands still."""
 
+import signal
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,11 +8,13 @@ from typing import Any, cast
 
 import pytest
 
-from runner.contract import Restarted
+from runner.contract import Refused, Restarted
 from runner.graph.ports import port_name
 from runner.graph.reading import load_graph
 from runner.message.codec import Step
+from runner.message.packet import Process
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
+from runner.supervise.child import Child
 from runner.supervise.supervisor import Supervisor
 from runner.terminal import Terminal
 from tests.runner.common.runs import ACCOUNT, TOYS
@@ -36,6 +39,24 @@ def test_a_call_that_ends_the_graph_is_done(tmp_path: Path, monkeypatch: pytest.
     supervisor._guardian.end = end
     supervisor._stop()
     assert calls.progress(CallQuestion(id, 0)).emitted == ("account.sum#0",)
+
+
+def test_a_device_that_is_asked_to_restart_is_not_killed_in_its_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("runner.supervise.guardian.RETIRE_SECONDS", -1)
+    supervisor, process, signals = supervisor_of(ACCOUNT, tmp_path), Process("counter", 0), list[int]()
+    guardian = supervisor._guardian
+    handle: Any = SimpleNamespace(poll=lambda: None, returncode=None, send_signal=signals.append)
+    guardian._children["counter", 0], guardian._ready[process] = Child(process, handle, tmp_path / "log"), 0.1
+    (tmp_path / "log").touch()
+    with pytest.raises(Refused, match=r"^counter is a device, whose step is not cut off"):
+        guardian.restart("counter", lambda: False)
+    guardian._check(guardian._children["counter", 0])
+    assert signals == [signal.SIGUSR1]
+    handle.poll, handle.returncode = (lambda: -signal.SIGKILL), -signal.SIGKILL
+    end = guardian._replace(guardian._children["counter", 0])
+    assert end.reason == "counter failed after 0 restarts: killed by SIGKILL"
+    guardian._children.clear()
+    supervisor._stop()
 
 
 def test_the_end_does_not_wait_for_a_step_that_cannot_be_sent(tmp_path: Path):
