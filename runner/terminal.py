@@ -1,6 +1,7 @@
 """What people see while a graph runs: one line at a time, with the time since the start and who says it."""
 
 import os
+import queue
 import shutil
 import sys
 import threading
@@ -13,6 +14,10 @@ from runner.contract import Level
 WIDTH = 16
 FEW = 5
 """Of many things, those that are named."""
+MOST_WAITING = 1000
+"""What may wait for a reader that stands still; what is said beyond that is left out."""
+LAST_SECONDS = 2.0
+"""Who takes nothing for so long at the end gets no more."""
 _COLOURS: dict[Level, str] = {"debug": "\033[2m", "info": "", "warning": "\033[33m", "error": "\033[31m"}
 _RESET = "\033[0m"
 
@@ -23,8 +28,12 @@ class Terminal:
     Where somebody looks, who goes on and on has one line, the newest, below what stays.
     """
 
-    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False):
-        """``verbose`` shows lines of level debug, too, and every line stays."""
+    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False, waits: bool = True):
+        """``verbose`` shows lines of level debug, too, and every line stays.
+
+        Unless it ``waits`` for its reader a thread prints, until it is closed: where the reader stands still, only who
+        prints does.
+        """
         self._stream = stream
         self._verbose = verbose
         self._seen = stream.isatty()
@@ -35,6 +44,11 @@ class Terminal:
         """Lines of progress that are on the screen."""
         self._started = time.monotonic()
         self._lock = threading.Lock()
+        self._printer = None if waits else threading.Thread(target=self._print_waiting, name="printer", daemon=True)
+        self._waiting: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        """What the printer is still to print."""
+        self._left_out = 0
+        """Lines since the last that was not."""
 
     def show(
         self, who: str, text: str, level: Level = "info", *, seconds: float | None = None, progress: str = ""
@@ -45,6 +59,10 @@ class Terminal:
         progress it tells, if it does: it replaces what told that before, but for warnings and longer texts, which stay.
         """
         if level == "debug" and not self._verbose:
+            return
+        if self._waiting.qsize() >= MOST_WAITING:
+            with self._lock:
+                self._left_out += 1
             return
         elapsed = time.monotonic() - self._started if seconds is None else seconds
         head = f"{elapsed:7.1f} s  {who:<{WIDTH}} "
@@ -78,11 +96,37 @@ class Terminal:
         """Puts a line above the progress, and that anew."""
         above = f"\033[{self._drawn}A\033[J" if self._drawn else ""
         self._drawn = len(self._progress)
+        left_out = f"{self._left_out} lines left out, nobody read: the recording has them\n" if self._left_out else ""
+        self._left_out = 0
+        text = f"{above}{left_out}{line}{progress}"
+        if self._printer is not None:
+            self._waiting.put(text)
+            if self._printer.ident is None:  # not before there is something to print: who forks must have one thread
+                self._printer.start()
+            return
         try:
-            self._stream.write(f"{above}{line}{progress}")
+            self._stream.write(text)
             self._stream.flush()
         except OSError:  # the terminal is gone, or the pipe's reader: the recording has it all
             self._discard()
+
+    def _print_waiting(self) -> None:
+        """Past Python's buffers, which the end of the process would wait for."""
+        while (text := self._waiting.get()) is not None:
+            data = text.encode(self._stream.encoding or "utf-8")
+            try:
+                while data:
+                    data = data[os.write(self._stream.fileno(), data) :]
+            except OSError:
+                self._discard()
+
+    def close(self) -> None:
+        """Returns once all is printed, or nobody takes it."""
+        self._waiting.put(None)
+        left = self._waiting.qsize() + 1
+        while self._printer is not None and self._printer.is_alive() and self._waiting.qsize() < left:
+            left = self._waiting.qsize()
+            self._printer.join(LAST_SECONDS)
 
     def _printable(self, line: str) -> str:
         """What a stage says must neither break the encoding of the terminal nor steer it."""

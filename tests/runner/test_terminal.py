@@ -51,6 +51,23 @@ def test_nothing_is_lost_with_a_reader_that_is_gone():
         terminal.plain("one", "two")
 
 
+def test_nobody_waits_for_a_reader_that_stands_still(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("runner.terminal.MOST_WAITING", 10)
+    monkeypatch.setattr("runner.terminal.LAST_SECONDS", 0.1)
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w") as stream, os.fdopen(reading) as reader:
+        terminal = Terminal(stream, waits=False)
+        for number in range(500):
+            terminal.show("camera", f"{number} {'x' * 1000}", seconds=0.0)
+        terminal.plain("the end")
+        terminal.close()
+        lines = list(iter(reader.readline, "the end\n"))
+    shown = [int(line.split()[3]) for line in lines if "camera" in line]
+    left_out = [int(line.split()[0]) for line in lines if "left out" in line]
+    assert left_out and shown == sorted(shown)
+    assert len(shown) + sum(left_out) == 500
+
+
 def on_screen(written: str) -> list[str]:
     """What is to be seen once all is written."""
     lines: list[str] = []

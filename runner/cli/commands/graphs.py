@@ -64,9 +64,9 @@ def _up(options: argparse.Namespace) -> int:
     if host is not None:
         refuse_settings(options.settings, host)
     become_clean("runner.cli", *options.arguments)
-    terminal = Terminal(verbose=options.verbose)
-    end = _supervise(options, terminal) if host is None else _take_part(options, document, host, terminal)
-    terminal.plain(end.reason)
+    with contextlib.closing(Terminal(verbose=options.verbose, waits=False)) as terminal:
+        end = _supervise(options, terminal) if host is None else _take_part(options, document, host, terminal)
+        terminal.plain(end.reason)
     return end.code
 
 
