@@ -67,8 +67,9 @@ class Forked(Handle):
 
     def send_signal(self, signum: int) -> None:
         """Signals this process alone; one that has gone is no error."""
-        if self.poll() is None:
-            os.kill(self.pid, signum)
+        with self._polling:  # so that no other thread sees its end meanwhile: until then the kernel keeps its id
+            if self.returncode is None:
+                os.kill(self.pid, signum)
 
     def kill(self) -> None:
         """Leaves nothing of it behind."""

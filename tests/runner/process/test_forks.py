@@ -1,6 +1,7 @@
 """Processes that are forked instead of started are as those that are started, for whoever looks after them."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import msgspec
 
 from runner.contract import Stage
 from runner.process.children import Handle, end_process
-from runner.process.forks import clean_environment
+from runner.process.forks import Forked, clean_environment
 from runner.process.stage_process import Assignment, prepare
 from tests.runner.common.survivors import lives
 from tests.runner.common.waiting import wait_until
@@ -58,6 +59,19 @@ def test_how_a_process_ends_is_known_to_who_started_it(tmp_path: Path):
     assert shown(tmp_path, script) == [[0, 7, 3, 1, 1, -signal.SIGKILL, -signal.SIGABRT], [[]]]
     assert (tmp_path / "3.txt").read_text() == "no room\n"
     assert (tmp_path / "4.txt").read_text().splitlines()[-1] == "ZeroDivisionError: division by zero"
+
+
+def test_a_process_whose_end_another_thread_sees_is_signalled_in_vain():
+    class Seen(Forked):
+        def poll(self) -> int | None:
+            found = super().poll()
+            wait_until(lambda: super(Seen, self).poll() is not None)
+            return found
+
+    process = Seen(os.posix_spawn("/bin/sleep", ["sleep", "0.1"], {}))
+    process.send_signal(signal.SIGCONT)
+    assert process.wait() == 0
+    process.send_signal(signal.SIGCONT)
 
 
 def test_a_process_is_waited_for_and_signalled_alone_or_with_its_group(tmp_path: Path):
