@@ -64,10 +64,10 @@ class Supervisor:
         self._terminal = terminal
         self._hosts = None if graph.layout == ALONE else Hosts(graph.name, file, graph.layout, self._say)
         self._calls = Calls(graph, self._publish)
-        endpoint, network = (self._hosts.endpoint, self._hosts.network) if self._hosts else (new_endpoint(), None)
-        gateway = new_endpoint(endpoint if network is None else "")
         with naming():
             self.id, recording = _new_recording(recordings, graph.name)
+            endpoint, network = (self._hosts.endpoint, self._hosts.network) if self._hosts else (new_endpoint(), None)
+            gateway = new_endpoint(endpoint if network is None else "")
             entry = Entry(
                 run=self.id,
                 gateway=gateway,

@@ -26,6 +26,14 @@ def supervisor_of(file: Path, folder: Path, *settings: str) -> Any:
     return Supervisor(graph, file=file, recordings=folder, settings=(), terminal=Terminal(), forks=forks)
 
 
+def test_a_run_that_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "file").touch()
+    with pytest.raises(Refused, match=r"file/account-.*: Not a directory"):
+        supervisor_of(ACCOUNT, tmp_path / "file")
+    assert [path.name for path in (tmp_path / "runner").iterdir()] == ["naming"]
+
+
 def test_a_call_that_ends_the_graph_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("runner.supervise.calls.PATIENCE_SECONDS", 0)
     supervisor, id = supervisor_of(ACCOUNT, tmp_path), "supervisor.account_add#0"
