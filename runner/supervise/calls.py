@@ -234,21 +234,30 @@ def _value(place: str, name: str, kind: Any, text: str) -> Any:
     try:
         return msgspec.convert(text, kind, strict=False)
     except msgspec.ValidationError as error:
-        reason = str(error).partition(" - at `")[0]
+        reason = str(error)
     try:
         return msgspec.convert(yaml.safe_load(text), kind)
-    except (msgspec.ValidationError, yaml.YAMLError):
-        raise Refused(f"{place}: {name}={text}: {reason}; valid: {_spelled(kind)}") from None
+    except msgspec.ValidationError as error:
+        reason = str(error)
+    except yaml.YAMLError:
+        pass
+    raise Refused(f"{place}: {name}={text}: {reason.partition(' - at `')[0]}; valid: {_spelled(kind)}")
 
 
 def _command_type(node: Node, name: str, kind: type[Command]) -> CommandType:
     texts = _field_texts(kind)
     fields = tuple(
-        Field(info.name, _spelled(info.type), None if info.required else repr(info.default), texts.get(info.name, ""))
+        Field(info.name, _spelled(info.type), _default(info), texts.get(info.name, ""))
         for info in msgspec.structs.fields(kind)
     )
     text = inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
     return CommandType(node.name, name, text, fields, tuple(map(port_name, kind.answers)))
+
+
+def _default(info: msgspec.structs.FieldInfo) -> str | None:
+    if info.required:
+        return None
+    return repr(info.default if info.default_factory is msgspec.NODEFAULT else info.default_factory())
 
 
 def _spelled(kind: Any) -> str:

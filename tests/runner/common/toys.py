@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -178,6 +179,7 @@ class Add(Command, frozen=True, kw_only=True):
     """May be negative."""
     mood: Literal["glad", "sad"] = "glad"
     note: str = ""
+    tags: list[str] = msgspec.field(default_factory=list[str])
 
 
 class Collect(Command, frozen=True, kw_only=True):

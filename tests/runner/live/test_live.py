@@ -240,6 +240,12 @@ def sum_of(progress: Progress) -> int:
         (
             "account",
             "add",
+            {"amount": "1", "tags": "[0]"},
+            r"account add: tags=\[0\]: Expected `str`, got `int`; valid: list",
+        ),
+        (
+            "account",
+            "add",
             {"amount": "1", "mood": "mad"},
             "account add: mood=mad: .*; valid: glad | sad",
         ),
@@ -262,6 +268,7 @@ def test_commands_describe_themselves() -> None:
         ("amount", "int", None, "May be negative."),
         ("mood", "glad | sad", "'glad'", ""),
         ("note", "str", "''", ""),
+        ("tags", "list", "[]", ""),
     ]
     assert collect.answers == ("sum",)
 
