@@ -186,6 +186,12 @@ class Recording:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
         return _decoded(self.run.get(name, ""), type(default)) or default
 
+    @property
+    def lasted_ns(self) -> int:
+        """From the first record to the last, as the recorder received them."""
+        times = [time_ns for _, time_ns, _ in self._order]
+        return max(times, default=0) - min(times, default=0)
+
     @cached_property
     def verdict(self) -> Completeness:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
@@ -295,7 +301,7 @@ class Recording:
     def require_messages(self) -> None:
         """Raises Refused where the run was asked to record none."""
         if self._steps_only:
-            raise Refused(f"{self.path}: holds no messages (runner up --steps-only): no stage can be executed again")
+            raise Refused(f"{self.path}: holds no messages (runner up --steps-only)")
 
     @property
     def _steps_only(self) -> bool:

@@ -17,8 +17,8 @@ from runner.inspect.info import Durations, StageTimes
 from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
 from runner.message.codec import Envelope, Step
-from runner.recording.recording import Recording
-from tests.runner.common.recordings import TOYS, record_toys
+from runner.recording.recording import STEPS_ONLY, Recording
+from tests.runner.common.recordings import TOYS, record_toys, rewrite
 from tests.runner.common.runs import ALBUM
 
 MS = 1_000_000
@@ -138,6 +138,25 @@ def test_a_message_that_one_recording_lacks(toys: Path, tmp_path: Path, capsys: 
     said = capsys.readouterr().out
     assert f"first difference: {lost}: only in {toys}" in said
     assert any(line.split() == ["gatherer/total", "1", "0"] for line in said.splitlines())
+
+
+# ------------------------------------------------------------------------------------ steps only
+
+
+def test_where_no_messages_were_recorded_none_are_compared_or_missed_and_steps_tell_the_time(
+    toys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    steps, _ = record_toys(tmp_path, keep=lambda record: record if isinstance(record, Step) else None)
+    path = rewrite(steps, tmp_path / "steps.mcap", lambda _, data: data, {"records": STEPS_ONLY})
+    for typed in (
+        ["diff", str(toys), str(path)],
+        ["diff", str(path), str(path)],
+        ["why", "sink.finished#0", str(path)],
+    ):
+        assert main(typed) == 2
+        assert capsys.readouterr() == ("", f"{path}: holds no messages (runner up --steps-only)\n")
+    assert main(["info", str(path)]) == 0
+    assert "lasted 0.00 ms" not in capsys.readouterr().out
 
 
 # ------------------------------------------------------------------------------------ step by step
