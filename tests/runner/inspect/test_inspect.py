@@ -90,6 +90,7 @@ def test_the_critical_path_goes_through_what_came_last(toys: Path):
     assert [hop.stage for hop in last.hops] == ["splitter", "worker", "gatherer", "sink"]
     times = [(hop.travelled_ns, hop.waited_ns, hop.computed_ns) for hop in last.hops]
     assert times == [tuple(MS * cost for cost in costs) for costs in COSTS.values()]
+    assert last.elapsed_ns >= sum(map(sum, times))
 
 
 def test_latency_by_edge_stage_and_lineage(toys: Path):
