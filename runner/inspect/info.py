@@ -172,9 +172,9 @@ def _aligned(row: Cells, widths: Sequence[int]) -> Iterator[str]:
 def seconds(nanoseconds: float) -> str:
     """A duration for people to read."""
     seconds = nanoseconds * 1e-9
-    if seconds >= 60:
-        return f"{seconds // 60:.0f} min {seconds % 60:.0f} s"
-    return f"{seconds:.2f} s" if seconds >= 1 else f"{seconds * 1e3:.2f} ms"
+    if round(seconds, 2) >= 60:
+        return "{} min {} s".format(*divmod(round(seconds), 60))
+    return f"{seconds:.2f} s" if round(seconds, 5) >= 1 else f"{seconds * 1e3:.2f} ms"
 
 
 def byte_count(count: float) -> str:

@@ -13,7 +13,7 @@ from runner.cli.main import main
 from runner.contract import Refused
 from runner.graph.reading import load_graph
 from runner.inspect.causes import Causes
-from runner.inspect.info import Durations, StageTimes
+from runner.inspect.info import Durations, StageTimes, seconds
 from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
 from runner.message.codec import Envelope, Step
@@ -170,6 +170,11 @@ def test_durations_in_little_memory_are_as_good_as_exact(times: list[int]):
         durations.note(one)
     assert (durations.total, durations.largest) == (sum(times), max(times))
     assert durations.median == pytest.approx(np.median(times), rel=0.01)
+
+
+def test_a_duration_is_rounded_before_it_is_put_into_words():
+    words = [seconds(1e9 * one) for one in (119.7, 60.2, 59.999, 59.99, 0.999999, 0.25)]
+    assert words == ["2 min 0 s", "1 min 0 s", "1 min 0 s", "59.99 s", "1.00 s", "250.00 ms"]
 
 
 def test_the_table_of_times_counts_steps_and_not_how_processes_end():
