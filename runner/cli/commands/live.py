@@ -67,7 +67,8 @@ def add_commands(commands: Commands) -> None:
 
 def _add_verbs(verbs: Commands) -> None:
     """What can be done with topics."""
-    _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
+    text = "every topic with its type, its consumers and how much flows from the processes that live now"
+    _add_run(add(verbs, "list", _topic_list, text))
     for name, verb, text, unit in (
         ("echo", _topic_echo, "print messages as they come, whatever their type", "messages"),
         ("hz", _topic_rate, "how often messages come, from their headers alone", "lines, one a second"),
