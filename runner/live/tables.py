@@ -102,8 +102,8 @@ def bandwidth_text(headers: Sequence[Header]) -> str:
 
 
 def _times(headers: Sequence[Header]) -> list[int]:
-    """When messages were sent; when they arrived, where a sender has another clock."""
-    sent = [header.sent_ns for header in headers]
+    """When messages were sent, in this order; when they arrived, where a sender has another clock."""
+    sent = sorted(header.sent_ns for header in headers)
     return sent if all(sent) else [header.arrived_ns for header in headers]
 
 

@@ -25,8 +25,8 @@ from runner.contract import Refused
 from runner.graph.graph import QUEUE
 from runner.graph.reading import load_graph
 from runner.inspect.echo import lines_of
-from runner.live.live import Live
-from runner.live.tables import show_progress
+from runner.live.live import Header, Live
+from runner.live.tables import rate_text, show_progress
 from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.recording.recording import Recording
 from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
@@ -450,6 +450,11 @@ def test_two_graphs_never_meet(account: Run, tmp_path: Path) -> None:
         assert [found.run for found in runs()] == [account.entry.run]
     finally:
         other.close()
+
+
+def test_no_interval_is_negative_where_what_replicas_sent_arrives_in_another_order() -> None:
+    headers = [Header(sent_ns, 0, 1) for sent_ns in (30_000_000, 10_000_000, 20_000_000)]
+    assert "shortest 10.00 ms, longest 10.00 ms" in rate_text(headers)
 
 
 # ------------------------------------------------------------------------------------------ echo
