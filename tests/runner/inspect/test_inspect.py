@@ -55,6 +55,7 @@ def test_the_tree_leads_back_to_the_start_of_the_lineage_with_every_hop(toys: Pa
 
 
 def test_the_newest_recording_is_the_default(toys: Path, capsys: pytest.CaptureFixture[str]):
+    (toys.parent / "dead.mcap").symlink_to("absent.mcap")
     assert main(["why", "counter.number#0", "--recordings", str(toys.parent)]) == 0
     assert "counter.number#0  Number" in capsys.readouterr().out
 
