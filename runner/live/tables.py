@@ -15,7 +15,6 @@ from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.document import suggest
 from runner.inspect.echo import lines_of
 from runner.inspect.info import byte_count, seconds, table
-from runner.inspect.logs import printed_lines
 from runner.live.live import Header
 from runner.message.codec import LogLine
 from runner.supervise.calls import CommandType, Progress
@@ -110,18 +109,13 @@ def _times(headers: Sequence[Header]) -> list[int]:
 # ------------------------------------------------------------------------------------------ log lines, calls
 
 
-def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> None:
+def show_lines(recording: Path, lines: Iterable[LogLine]) -> None:
     """Prints log lines as they come, with the time since the start of the run."""
     terminal, began = Terminal(sys.stdout), _began(recording)
-    seen: set[str] = set()
     for line in lines:
-        seen.add(line.stage)
-        if stage in (None, line.stage):
-            began = began or line.time_ns
-            name = f"{line.stage}.{line.replica}" if line.replica else line.stage
-            terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    if stage is not None and stage not in seen and not any(printed_lines(recording, stage)):
-        raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
+        began = began or line.time_ns
+        name = f"{line.stage}.{line.replica}" if line.replica else line.stage
+        terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
 
 
 def _began(recording: Path) -> int:

@@ -120,7 +120,7 @@ def opened(graph: Graph, sealed: Envelope) -> Message | None:
         raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
-def _decoded(text: str, kind: type[T]) -> T:
+def decoded(text: str, kind: type[T]) -> T:
     """What a JSON text holds; nothing (``kind()``) where it is none or of another type."""
     try:
         return msgspec.convert(json.loads(text), kind)
@@ -184,7 +184,7 @@ class Recording:
 
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
-        return _decoded(self.run.get(name, ""), type(default)) or default
+        return decoded(self.run.get(name, ""), type(default)) or default
 
     @property
     def lasted_ns(self) -> int:
@@ -196,7 +196,7 @@ class Recording:
     def verdict(self) -> Completeness:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
-        counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
+        counts = decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason, run = self._breakage or written.get("reason", ""), written.get("run", "")
         if self._steps_only:
             return Completeness(False, (), reason, counts, run)
@@ -327,6 +327,6 @@ class Recording:
         proof = Proof(self.graph)
         for entry in self._order:
             proof.enter(*entry)
-        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
+        for id in decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof

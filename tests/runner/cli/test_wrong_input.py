@@ -58,6 +58,7 @@ def no_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["check", *GRAPH, "score=toys"], "--set score: 'toys' does not fit (module:Class)"),
         (["doctor", "--recordings", __file__], f"recordings     {__file__} is no folder that can be written"),
         (["up", str(TOYS), "--arm"], "toys.yaml: --arm: no stage has the setting 'armed'"),
+        (["logs", "--run", "toys", "--recordings", "."], "runner logs: --run NAME or --recordings DIR, not both"),
         (["page", "--port", "99999"], "argument --port: '99999': must be 0 to 65535"),
         (["call", "account", "add", "amount=1", "amount=2"], "amount=2: amount is given twice"),
     ],
@@ -72,7 +73,12 @@ def test_it_is_said_in_one_line(typed: list[str], said: str, capsys: pytest.Capt
 @pytest.mark.parametrize("stage", ["/home/somebody/toys.mcap", "**", "a[b"])
 def test_the_log_of_no_stage(toys: Path, stage: str, capsys: pytest.CaptureFixture[str]):
     assert status(["logs", stage, "--recordings", str(toys.parent)]) == 2
-    assert f"nothing from a stage {stage!r}; valid: none" in capsys.readouterr().err
+    assert f"no stage {stage!r}; valid: counter, gatherer, recorder, sink, " in capsys.readouterr().err
+
+
+def test_a_stage_that_has_said_nothing_has_an_empty_log(toys: Path, capsys: pytest.CaptureFixture[str]):
+    assert status(["logs", "counter", "--recordings", str(toys.parent)]) == 0
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_message_that_is_not_there_has_neighbours(toys: Path, capsys: pytest.CaptureFixture[str]):
