@@ -23,10 +23,13 @@ class Terminal:
     Where somebody looks, who goes on and on has one line, the newest, below what stays.
     """
 
-    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False):
-        """``verbose`` shows lines of level debug, too, and every line stays."""
+    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False, needs_reader: bool = False):
+        """``verbose`` shows lines of level debug, too, and every line stays. ``needs_reader`` raises OSError where the
+        lines cannot be printed any more.
+        """
         self._stream = stream
         self._verbose = verbose
+        self._needs_reader = needs_reader
         self._seen = stream.isatty()
         self._colours = self._seen and not os.environ.get("NO_COLOR")
         self._progress: dict[str, str] = {}
@@ -83,6 +86,8 @@ class Terminal:
             self._stream.flush()
         except OSError:  # the terminal is gone, or the pipe's reader: the recording has it all
             self._discard()
+            if self._needs_reader:
+                raise
 
     def _printable(self, line: str) -> str:
         """What a stage says must neither break the encoding of the terminal nor steer it."""

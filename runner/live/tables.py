@@ -110,8 +110,8 @@ def _times(headers: Sequence[Header]) -> list[int]:
 
 
 def show_lines(recording: Path, lines: Iterable[LogLine]) -> None:
-    """Prints log lines as they come, with the time since the start of the run."""
-    terminal, began = Terminal(sys.stdout), _began(recording)
+    """Prints log lines as they come and somebody reads them, with the time since the start of the run."""
+    terminal, began = Terminal(sys.stdout, needs_reader=True), _began(recording)
     for line in lines:
         began = began or line.time_ns
         name = f"{line.stage}.{line.replica}" if line.replica else line.stage

@@ -27,7 +27,7 @@ from runner.graph.graph import QUEUE
 from runner.graph.reading import load_graph
 from runner.inspect.echo import lines_of
 from runner.live.live import Header, Live
-from runner.live.tables import rate_text, show_progress
+from runner.live.tables import rate_text, show_lines, show_progress
 from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.recording.recording import Recording
 from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
@@ -432,6 +432,14 @@ def test_the_recording_of_a_run_that_has_just_begun_is_waited_for(
         assert main([command]) == 0
     finally:
         listed.close()
+
+
+def test_log_lines_end_with_who_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream, monkeypatch.context() as patch, pytest.raises(BrokenPipeError):
+        patch.setattr(sys, "stdout", stream)
+        show_lines(Path("toys.mcap"), [LogLine("sink", 0, "info", "done", 1)])
 
 
 def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
