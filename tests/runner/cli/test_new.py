@@ -70,10 +70,12 @@ def test_it_is_clean(project: Path):
     [
         (
             "Weather-Station",
-            "lower case letters, digits and _, the first a letter; valid, for example: weather_station",
+            "lower case letters, digits and _, the first a letter, the last no _; valid, for example: weather_station",
         ),
-        ("2fast", "lower case letters, digits and _, the first a letter; valid, for example: my_2fast"),
-        ("", "lower case letters, digits and _, the first a letter; valid, for example: robot"),
+        ("2fast", "lower case letters, digits and _, the first a letter, the last no _; valid, for example: my_2fast"),
+        ("", "lower case letters, digits and _, the first a letter, the last no _; valid, for example: robot"),
+        ("robot_", "the last no _; valid, for example: robot"),
+        ("x" * 300, f"the last no _; valid, for example: {'x' * 32}"),
         ("class", "'class' means something else in Python; valid, for example: my_class"),
         ("tests", "'tests' means something else in a project; valid, for example: my_tests"),
         (
