@@ -174,11 +174,11 @@ class RecordedDetections(Stage):
         confidences = np.zeros((len(detections), len(self._labels)))
         for row, detection in zip(confidences, detections, strict=True):
             row[self._labels.index(detection.label)] = detection.score
-        boxes = np.array([detection.box for detection in detections]).reshape(-1, 4)
-        return _candidates(boxes, confidences, self._labels)
+        candidates = tuple(Candidate(box=item.box, label=item.label, confidence=item.score) for item in detections)
+        return Candidates(candidates=candidates, labels=self._labels, confidences=confidences)
 
 
-def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int = 0) -> Candidates:
+def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int) -> Candidates:
     """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt.
 
     Of these, labels that are surely seen come last: most objects are there once. But what is surely seen in a box about

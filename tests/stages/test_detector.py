@@ -222,6 +222,12 @@ def test_recorded_detections_answer_each_image_in_file_order(tmp_path: Path) -> 
     np.testing.assert_array_equal(message.confidences.max(axis=1), [0.5, 0.9])
 
 
+def test_a_recorded_label_holds_at_a_score_of_nothing(tmp_path: Path) -> None:
+    stage = recorded(tmp_path, [entry(score=0)])
+    (message,) = run_stage(stage, [frame(np.zeros((4, 4, 3), np.uint8), scene_id=1, image_id=2)])
+    assert [(one.label, one.confidence) for one in message.candidates] == [("cup", 0.0)]
+
+
 def test_an_image_that_the_file_lacks_is_empty_and_says_so(tmp_path: Path) -> None:
     lines: list[tuple[str, str]] = []
     stage = recorded(tmp_path, [entry()])
