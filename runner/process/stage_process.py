@@ -25,7 +25,7 @@ from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, 
 from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import die_with_parent, prefer_for_oom_kill, print_where_it_crashes
+from runner.process.children import die_with_parent, last_words, prefer_for_oom_kill, print_where_it_crashes
 from runner.process.delivery import Delivery, Stopped
 from runner.process.forks import EXIT_FAILED
 from runner.process.health import Heartbeat
@@ -185,7 +185,7 @@ class StageProcess:
     def _on_presence(self, process: Process, present: bool) -> None:
         own = self._process
         if present and process > own and process.place == own.place:
-            print(f"cut off meanwhile, and replaced by incarnation {process.incarnation}", file=sys.stderr, flush=True)
+            last_words(f"cut off meanwhile, and replaced by incarnation {process.incarnation}")
             os._exit(EXIT_FAILED)
         self._presence.update(process, present)
         if present:
@@ -427,17 +427,13 @@ def main() -> int:
         signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
     except Refused as refusal:
-        code = _fail(str(refusal), EXIT_REFUSED)
+        code = EXIT_REFUSED
+        last_words(str(refusal))
     except BaseException as error:
-        traceback.print_exc()
-        code = _fail(_summary(error), EXIT_FAILED)
+        code = EXIT_FAILED
+        last_words(f"{traceback.format_exc()}{_summary(error)}")
     if process is not None:
         process.close(failed=code != 0)
-    return code
-
-
-def _fail(reason: str, code: int) -> int:
-    print(reason, file=sys.stderr, flush=True)
     return code
 
 
