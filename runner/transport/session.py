@@ -136,15 +136,16 @@ def open_session(
     network: Network | None = None,
     *,
     mode: str = "peer",
+    calls_once: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
-    """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes a client."""
-    calls_once = mode == "client" and not (network is not None and network.routed)
+    """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes the call of one
+    who ``calls_once``."""
     told: dict[str, Any] = {
         "mode": mode,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        # A router may be started after those that call it.
+        # A router may be started after those that call it, and whoever is called may stand still.
         "connect/timeout_ms": CALL_MS if calls_once else -1,
         "connect/exit_on_failure": calls_once,
         "scouting/multicast/enabled": False,
