@@ -1,5 +1,7 @@
 """A process on its way into its run, and out of it."""
 
+import contextlib
+import socket
 import threading
 from typing import Any
 
@@ -54,3 +56,19 @@ def test_who_overhears_waits_for_a_gateway_that_does_not_take_the_call_at_once(m
     late.join()
     bus.close()
     gateways[0].close()
+
+
+@pytest.mark.slow
+def test_who_calls_a_process_that_stands_still_waits_for_longer_than_zenoh_would():
+    endpoint = new_endpoint()
+    with socket.socket(socket.AF_UNIX) as still:
+        still.bind(endpoint.partition("/")[2])
+        still.listen()
+        bus = Bus("test", endpoint)
+        call, _ = still.accept()
+        call.settimeout(12)
+        with call, contextlib.suppress(TimeoutError):
+            while call.recv(4096):
+                pass
+            pytest.fail("the call was given up")
+    bus.close()
