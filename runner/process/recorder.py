@@ -195,8 +195,8 @@ class Recorder:
         topic = packet.key.partition("/")[2]
         if not self._manifest.steps_only:
             self._writer.put(envelope, packet.payload)
-        for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
-            self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
+        for consumer, taker, port in self._redelivery.note_message(topic, envelope, packet.payload):
+            self._say(f"j/{consumer}", pack(Journal(answered=((taker, port, envelope.id),))))
 
     def _on_step(self, step: Step, packet: Packet) -> None:
         """Refuses what a process says that is dead: the others know it as lost, and do its work again."""

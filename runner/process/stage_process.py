@@ -21,7 +21,7 @@ from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.graph.reading import node_from_entry
 from runner.message import codec
-from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, Step, answered
+from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, Step
 from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
@@ -204,8 +204,8 @@ class StageProcess:
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
         """What a step has done with is acknowledged by it, once the recorder has the step."""
         consumer = packet.end
-        for done in (journal.answered, *map(answered, journal.steps)):
-            self._delivery.answered(consumer, done)
+        for replica, done in journal.done():
+            self._delivery.answered(consumer, replica, done)
             if consumer == self._process.stage:
                 self._intake.forget(done)
         own = [step for step in journal.steps if step.process == self._process]
