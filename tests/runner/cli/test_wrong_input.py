@@ -90,9 +90,14 @@ def test_a_message_that_is_not_there_has_neighbours(toys: Path, capsys: pytest.C
 def test_a_viewer_is_not_opened_for_nothing(toys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert status(["view", "nothing.mcap", "--live"]) == 2
     assert "nothing.mcap: no such file" in capsys.readouterr().err
-    for option in ("--save", "--png"):
-        assert status(["view", str(toys), option, str(tmp_path)]) == 2
-        assert f"{tmp_path}: cannot be written" in capsys.readouterr().err
+    for option, suffix in (("--save", ".rrd"), ("--png", ".png")):
+        assert status(["view", str(toys), option, str(toys)]) == 2
+        assert capsys.readouterr().err == f"{option} {toys}: must end in {suffix}\n"
+    assert status(["view", "--live", "--png", "toys.png"]) == 2
+    assert "--png shows a graph that has ended" in capsys.readouterr().err
+    (tmp_path / "toys.rrd").touch()
+    assert status(["view", str(toys), "--save", str(tmp_path / "toys.rrd")]) == 2
+    assert "toys.rrd: cannot be written: File exists" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
