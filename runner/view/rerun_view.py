@@ -114,7 +114,7 @@ def view_live(path: Path | None = None, save: Path | None = None) -> None:
 def newest_live(folder: Path) -> Path:
     """The newest recording that a running graph writes; raises Refused where there is none."""
     for path in recordings_in(folder):
-        with path.open("rb") as file:
+        with contextlib.suppress(OSError), path.open("rb") as file:  # another user's, or gone
             if is_being_written(file):
                 return path
     raise Refused(f"{folder}: no graph is running here: no recording is being written")

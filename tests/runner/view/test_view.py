@@ -99,6 +99,7 @@ def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
     stream.disconnect()
     assert not viewer.is_alive()
     assert "/camera/boxes" in entities(tmp_path / "live.rrd")
+    (tmp_path / "unreadable.mcap").mkdir()
     with pytest.raises(Refused, match="no graph is running"):
         newest_live(tmp_path)
 
