@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import math
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 
@@ -36,12 +37,22 @@ from runner.process.step import Executor, step_time
 from runner.recording.recording import Recording
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
+from runner.transport.vital import vital_thread
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
 CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
 """How long it may take at the end until the recorder says that it has a step."""
+
+LOOK_SECONDS = 0.25
+STANDSTILL_SECONDS = 1.0
+"""Between two looks, or the process has stood still."""
+CUT_OFF_SECONDS = 10.0
+"""How long the supervisor may take to say that a process is dead that has gone: links to a machine that is cut off are
+not given up at the same moment."""
+FIRST_SECONDS = 2.0
+"""The same for who has stood still itself."""
 
 
 class Assignment(msgspec.Struct, frozen=True):
@@ -168,6 +179,8 @@ class StageProcess:
         self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
+        if self._may_be_cut_off:
+            vital_thread("cut off", self._end_when_cut_off).start()
         self._heartbeat.start()
         self._bus.announce()
 
@@ -185,13 +198,33 @@ class StageProcess:
     def _on_presence(self, process: Process, present: bool) -> None:
         own = self._process
         if present and process > own and process.place == own.place:
-            last_words(f"cut off meanwhile, and replaced by incarnation {process.incarnation}")
-            os._exit(EXIT_FAILED)
+            _end_at_once(f"cut off meanwhile, and replaced by incarnation {process.incarnation}")
+        if not present and process.stage == RECORDER and self._may_be_cut_off and not self._stopping.is_set():
+            _end_at_once("cut off from the recorder")  # before it has a step and lacks the one before
         self._presence.update(process, present)
         if present:
             self._delivery.appeared(process)
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
+
+    @property
+    def _may_be_cut_off(self) -> bool:
+        """Whether links are given up while both ends live."""
+        return self._task.network is not None and self._task.network.credentials is not None
+
+    def _end_when_cut_off(self) -> None:
+        """Ends this process where another that it hears or feeds has gone for it alone: what was sent meanwhile is lost
+        until one of the two is replaced. Who has stood still goes first, who is not replaced last."""
+        others = {edge.stage for edge in self._node.inputs.values()} | {route.consumer for route in self._task.routes}
+        looked, stood_still = time.monotonic(), -math.inf
+        while not self._stopping.wait(LOOK_SECONDS):
+            before, looked = looked, time.monotonic()
+            if looked - before > STANDSTILL_SECONDS:
+                stood_still = looked
+            first = looked - stood_still < CUT_OFF_SECONDS
+            patience = 2 * CUT_OFF_SECONDS if not self._node.restarts else FIRST_SECONDS if first else CUT_OFF_SECONDS
+            if cut_off := self._presence.cut_off(others, patience):
+                _end_at_once(f"cut off from {', '.join(f'{one.stage}.{one.replica}' for one in cut_off)}")
 
     def _on_caught_up(self, caught_up: CaughtUp, _: Packet) -> None:
         self._delivery.take_over(caught_up.undone)
@@ -389,6 +422,12 @@ class _Record:
             error=self.error,
             left=left,
         )
+
+
+def _end_at_once(reason: str) -> NoReturn:
+    """Ends this process from any of its threads; another takes its place."""
+    last_words(reason)
+    os._exit(EXIT_FAILED)
 
 
 def _summary(error: BaseException) -> str:
