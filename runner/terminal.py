@@ -28,14 +28,18 @@ class Terminal:
     Where somebody looks, who goes on and on has one line, the newest, below what stays.
     """
 
-    def __init__(self, stream: TextIO = sys.stdout, *, verbose: bool = False, waits: bool = True):
-        """``verbose`` shows lines of level debug, too, and every line stays.
+    def __init__(
+        self, stream: TextIO = sys.stdout, *, verbose: bool = False, needs_reader: bool = False, waits: bool = True
+    ):
+        """``verbose`` shows lines of level debug, too, and every line stays. ``needs_reader`` raises OSError where the
+        lines cannot be printed any more.
 
         Unless it ``waits`` for its reader a thread prints, until it is closed: where the reader stands still, only who
         prints does.
         """
         self._stream = stream
         self._verbose = verbose
+        self._needs_reader = needs_reader
         self._seen = stream.isatty()
         self._colours = self._seen and not os.environ.get("NO_COLOR")
         self._progress: dict[str, str] = {}
@@ -109,6 +113,8 @@ class Terminal:
             self._stream.flush()
         except OSError:  # the terminal is gone, or the pipe's reader: the recording has it all
             self._discard()
+            if self._needs_reader:
+                raise
 
     def _print_waiting(self) -> None:
         """Past Python's buffers, which the end of the process would wait for."""

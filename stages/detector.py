@@ -157,11 +157,17 @@ class RecordedDetections(Stage):
 
         detections: Path
         catalogue: Path
+        stride: int = 1
+        """The camera's: boxes are in pixels of the whole image, of which it may give every so many rows and columns."""
+
+        def __post_init__(self) -> None:
+            if self.stride < 1:
+                raise Refused(f"detector.stride = {self.stride}: must be 1 (all pixels) or more")
 
     def __init__(self, config: Config) -> None:
         names = {item.label: name for name, item in Catalogue.load(config.catalogue).objects.items()}
         self._labels = tuple(names.values())
-        self._name = config.detections.name
+        self._name, self._stride = config.detections.name, config.stride
         self._images: dict[tuple[int, int], list[Detection]] = defaultdict(list)
         for detection in read_detections(config.detections, names):
             self._images[detection.scene_id, detection.image_id].append(detection)
@@ -174,11 +180,13 @@ class RecordedDetections(Stage):
         confidences = np.zeros((len(detections), len(self._labels)))
         for row, detection in zip(confidences, detections, strict=True):
             row[self._labels.index(detection.label)] = detection.score
-        boxes = np.array([detection.box for detection in detections]).reshape(-1, 4)
-        return _candidates(boxes, confidences, self._labels)
+        candidates = tuple(
+            Candidate(box=item.box / self._stride, label=item.label, confidence=item.score) for item in detections
+        )
+        return Candidates(candidates=candidates, labels=self._labels, confidences=confidences)
 
 
-def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int = 0) -> Candidates:
+def _candidates(boxes: Floats, confidences: Floats, labels: tuple[str, ...], *, others: int) -> Candidates:
     """Equation 1: each box with its most confident label, and with up to so many ``others`` where that is in doubt.
 
     Of these, labels that are surely seen come last: most objects are there once. But what is surely seen in a box about

@@ -16,6 +16,7 @@ from runner.contract import Context, Level, Message, Refused
 from stages.appraiser import Appraiser
 from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
+from stages.geometry.camera import checked_intrinsics
 from stages.geometry.lens import Lens
 from stages.hypotheses import Hypotheses
 from stages.messages import (
@@ -92,9 +93,9 @@ def estimate_scene(
     """The objects on the table in one image, where they are, and how they relate.
 
     ``rgb`` is H x W x 3, sRGB, ``depth`` H x W metres registered to it, 0 or not finite where there is no reading;
-    ``K`` 3 x 3, pixel centres at integer coordinates; ``distortion`` are OpenCV's coefficients (k1 k2 p1 p2 k3) of the
-    lens that is still in both; boxes and poses are those of the straight image. ``catalogue`` is a YAML file or a BOP
-    ``models`` folder.
+    ``K`` 3 x 3 without skew, pixel centres at integer coordinates; ``distortion`` are OpenCV's coefficients (k1 k2 p1
+    p2 k3) of the lens that is still in both; boxes and poses are those of the straight image. ``catalogue`` is a YAML
+    file or a BOP ``models`` folder.
 
     Candidates are the ``boxes``, else what ``detector`` finds, else what the network that comes with the package does;
     it knows the objects of its own catalogue. Of these the scene has ``n_objects``, or as many as explain the image
@@ -237,8 +238,12 @@ def _frame(rgb: NDArray[np.uint8], depth: NDArray[np.floating[Any]], K: Floats, 
         raise Refused(f"depth is {depth.dtype} {depth.shape}; {rgb.shape[:2]} of floats, metres, is expected")
     if np.shape(K) != (3, 3):
         raise Refused(f"K is {np.shape(K)}; 3 x 3 is expected")
+    try:
+        checked = checked_intrinsics(np.array(K, float))
+    except ValueError as error:
+        raise Refused(str(error)) from None
     return Frame(
-        rgb=np.ascontiguousarray(rgb), depth=np.ascontiguousarray(depth, np.float32), K=np.array(K, float),
+        rgb=np.ascontiguousarray(rgb), depth=np.ascontiguousarray(depth, np.float32), K=checked,
         T_base_camera=None if T_base_camera is None else np.array(T_base_camera, float), robot_mask=None,
         name="image", index=0, total=1,
     )  # fmt: skip

@@ -60,6 +60,11 @@ def test_the_keys_between_hosts_are_listed():
     assert [key for key in keys if f"| `{key}` |" not in text] == []
 
 
+def test_the_listener_is_given_an_address_a_run_and_schemas():
+    text = "\n".join(document.read_text() for document in DOCUMENTS)
+    assert re.findall(r"python examples/listen.py \S+ \S+ (\S+)", text) == ["schemas.json", "schemas.json"]
+
+
 def test_the_packages_that_the_runner_needs_are_counted():
     count = len(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"])
     said = f"{count} needed, {count} known as tested"

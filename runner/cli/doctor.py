@@ -201,20 +201,31 @@ def _memory() -> Finding:
     available = psutil.virtual_memory().available
     limit, used = _group("memory.max"), _group("memory.current")
     if limit is not None and used is not None:
-        available = min(available, limit - used)
+        available = min(available, limit - used + _idle_files())
     group = f", the control group allows {byte_count(limit)}" if limit is not None else ""
     remedy = "" if available >= LEAST_MEMORY else "end other programs, or give the container more memory"
     return Finding("bad" if remedy else "good", "memory", f"{byte_count(available)} available{group}", remedy)
 
 
+def _idle_files() -> int:
+    """Bytes that the control group uses for files nobody has read of late: the system gives them back when asked."""
+    used = dict(line.split() for line in _group_text("memory.stat").splitlines())
+    return int(used.get("inactive_file", 0))
+
+
 def _group(name: str) -> int | None:
-    """A limit of this process' control group (version 2), or None where there is none."""
+    """A limit of this process' control group, or None where there is none."""
+    text = _group_text(name)
+    return int(text) if text.isdecimal() else None
+
+
+def _group_text(name: str) -> str:
+    """What a file of this process' control group (version 2) says; nothing where it is not there."""
     try:
         own = Path("/proc/self/cgroup").read_text().splitlines()[-1].split("::")[1].lstrip("/")
-        text = (Path("/sys/fs/cgroup") / own / name).read_text().strip()
+        return (Path("/sys/fs/cgroup") / own / name).read_text().strip()
     except (OSError, IndexError):
-        return None
-    return int(text) if text.isdecimal() else None
+        return ""
 
 
 def _limits() -> Finding:

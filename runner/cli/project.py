@@ -35,8 +35,8 @@ def new_project(name: str, parent: Path) -> list[Path]:
 
 def _why_not(name: str, parent: Path) -> str | None:
     """What is wrong with a name, or nothing."""
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        return "a package's name is lower case letters, digits and _, the first a letter"
+    if not re.fullmatch(r"[a-z]([a-z0-9_]{0,62}[a-z0-9])?", name):
+        return "a package's name is up to 64 lower case letters, digits and _, the first a letter, the last no _"
     if keyword.iskeyword(name) or name in OWN_FOLDERS:
         return f"{name!r} means something else in {'Python' if keyword.iskeyword(name) else 'a project'}"
     if (parent / name).exists():
@@ -48,7 +48,7 @@ def _why_not(name: str, parent: Path) -> str | None:
 
 def _valid_name(name: str, parent: Path) -> str:
     """The nearest name that can be taken."""
-    base = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "robot"
+    base = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:32].rstrip("_") or "robot"
     others = itertools.chain((base, f"my_{base}"), (f"my_{base}_{number}" for number in itertools.count(2)))
     return next(other for other in others if _why_not(other, parent) is None)
 

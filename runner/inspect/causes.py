@@ -42,8 +42,10 @@ class Causes:
         """The tree of causes as lines: each message with the queueing, transport and computing of its step.
 
         It ends where the message's lineage starts, which for what is perceived is the look. What leads to a message
-        twice is shown once. Raises Refused where nothing in the recording speaks of the message.
+        twice is shown once. Raises Refused where nothing in the recording speaks of the message, or the run
+        recorded none.
         """
+        self._recording.require_messages()
         if id not in self._steps:
             self._recording.require(id)
         root = self._root_of(id)

@@ -126,12 +126,16 @@ def _bits(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _gap(recorded: Any, replayed: Any) -> float | None:
-    numbers = isinstance(recorded, int | float) and not isinstance(recorded, bool)
-    return _largest(np.array([recorded]), np.array([replayed])) if numbers else None
+    if isinstance(recorded, int) and not isinstance(recorded, bool):
+        return float(abs(recorded - replayed))
+    return _largest(np.array([recorded]), np.array([replayed])) if isinstance(recorded, float) else None
 
 
 def _largest(recorded: NDArray[Any], replayed: NDArray[Any]) -> float:
     """Largest absolute difference; infinite where a number became NaN or infinite or the other way round."""
+    if recorded.dtype.kind in "iu":  # as integers: float64 would round those beyond 2**53
+        above, below = (choose(recorded, replayed).astype(np.uint64) for choose in (np.maximum, np.minimum))
+        return float(np.max(above - below, initial=0))
     with np.errstate(all="ignore"):
         gaps = np.abs(recorded.astype(np.float64) - replayed.astype(np.float64))
     gaps[(recorded == replayed) | (np.isnan(recorded) & np.isnan(replayed))] = 0.0

@@ -19,8 +19,11 @@ always differ."""
 
 
 def diff(a: Path, b: Path) -> int:
-    """Prints how two recordings differ; returns 1 where they do. Raises Refused where one is no recording."""
+    """Prints how two recordings differ; returns 1 where they do. Raises Refused where one is no recording, or one of a
+    run that recorded no messages."""
     first, second = Recording(a), Recording(b)
+    for recording in (first, second):
+        recording.require_messages()
     for recording in (first, second):
         print(f"{recording.path}: {len(recording.messages)} messages, {recording.verdict}")
     for line in _origins(first, second):

@@ -33,12 +33,11 @@ def describe(path: Path) -> str:
 def _origin(recording: Recording) -> Iterator[str]:
     run, machine = recording.run, recording.aspect("machine", dict[str, str]())
     settings = recording.aspect("settings", list[str]())
-    times = [message.log_time_ns for message in recording.messages.values()]
     restarts = sum(message.topic == RESTARTED for message in recording.messages.values())
-    counts = f"{len(times)} messages, {restarts} restart{'' if restarts == 1 else 's'}"
+    counts = f"{len(recording.messages)} messages, {restarts} restart{'' if restarts == 1 else 's'}"
     yield f"{recording.path}: {recording.verdict}"
     yield f"graph     {run.get('name')} (seed {run.get('seed')}{''.join(f', --set {text}' for text in settings)})"
-    yield f"started   {run.get('started')}, lasted {seconds(max(times, default=0) - min(times, default=0))}"
+    yield f"started   {run.get('started')}, lasted {seconds(recording.lasted_ns)}"
     yield f"size      {byte_count(recording.path.stat().st_size)}, {counts}"
     yield f"revision  {run.get('revision') or 'unknown'}"
     if "runner" in run:
@@ -173,9 +172,9 @@ def _aligned(row: Cells, widths: Sequence[int]) -> Iterator[str]:
 def seconds(nanoseconds: float) -> str:
     """A duration for people to read."""
     seconds = nanoseconds * 1e-9
-    if seconds >= 60:
-        return f"{seconds // 60:.0f} min {seconds % 60:.0f} s"
-    return f"{seconds:.2f} s" if seconds >= 1 else f"{seconds * 1e3:.2f} ms"
+    if round(seconds, 2) >= 60:
+        return "{} min {} s".format(*divmod(round(seconds), 60))
+    return f"{seconds:.2f} s" if round(seconds, 5) >= 1 else f"{seconds * 1e3:.2f} ms"
 
 
 def byte_count(count: float) -> str:

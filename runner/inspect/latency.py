@@ -29,7 +29,8 @@ class CriticalPath:
     lineage: str
     last: str
     elapsed_ns: int
-    """From the first message to the last, as the recorder received them."""
+    """From the first message to the last, as the recorder received them, which it does every few milliseconds; at
+    least what the hops cost."""
     hops: tuple[Step, ...]
 
 
@@ -59,8 +60,13 @@ def critical_paths(recording: Recording, causes: Causes) -> list[CriticalPath]:
         first, last = min(messages, key=received), max(messages, key=received)
         steps = (causes.step_of(id) for id in causes.path_to(last.id)[1:])
         if hops := tuple(step for step in steps if step is not None):
-            paths.append(CriticalPath(lineage, last.id, last.log_time_ns - first.log_time_ns, hops))
+            elapsed_ns = max(last.log_time_ns - first.log_time_ns, sum(map(_cost, hops)))
+            paths.append(CriticalPath(lineage, last.id, elapsed_ns, hops))
     return sorted(paths, key=lambda path: -path.elapsed_ns)
+
+
+def _cost(hop: Step) -> int:
+    return hop.travelled_ns + hop.waited_ns + hop.computed_ns
 
 
 # ------------------------------------------------------------------------------------ tables
@@ -110,7 +116,7 @@ def _path_line(path: CriticalPath) -> str:
     """The costliest hops in the order of the path; further visits of a stage are added to its first."""
     by_stage = Counter[str]()
     for hop in path.hops:
-        by_stage[hop.stage] += hop.travelled_ns + hop.waited_ns + hop.computed_ns
+        by_stage[hop.stage] += _cost(hop)
     costly = {stage for stage, _ in by_stage.most_common(HOPS)}
     named = [f"{stage} {seconds(total)}" for stage, total in by_stage.items() if stage in costly]
     if rest := sum(total for stage, total in by_stage.items() if stage not in costly):

@@ -3,26 +3,41 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from mcap.records import Metadata
 
 from runner.contract import Refused
+from runner.graph.document import suggest
+from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CodecError, LogLine, unpack
+from runner.message.packet import RECORDER
 from runner.recording.container import Container, Growing, open_file, recordings_in
-from runner.recording.recording import LOG
+from runner.recording.recording import LOG, RUN, decoded
 
 
-def log_lines(path: Path, *, follow: bool) -> Iterator[LogLine]:
-    """Every line in the order of recording; with ``follow`` goes on until the graph has ended."""
+def log_lines(path: Path, stage: str | None, *, follow: bool) -> Iterator[LogLine]:
+    """Every line, or those of one stage, in the order of recording; with ``follow`` goes on until the graph has ended.
+
+    Raises Refused where the graph has no such stage.
+    """
     with open_file(path) as file:
         source: IO[bytes] | Growing = Growing(file) if follow else file
         for record in Container(source, str(path)):
-            if not isinstance(record, Metadata) and record.topic.startswith(LOG):
+            if isinstance(record, Metadata):
+                if record.name == RUN and stage is not None:
+                    _require(stage, decoded(record.metadata.get("graph", ""), dict[str, Any]), path)
+            elif record.topic.startswith(LOG) and stage in (None, record.topic.removeprefix(LOG)):
                 with contextlib.suppress(CodecError):
                     yield unpack(LogLine, record.message.data)
+
+
+def _require(stage: str, graph: Mapping[str, Any], path: Path) -> None:
+    speakers = (*graph.get("stages", ()), SUPERVISOR, RECORDER)
+    if stage not in speakers:
+        raise Refused(f"{path}: no stage {stage!r}{suggest(stage, speakers)}")
 
 
 def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -127,6 +128,14 @@ class Live(contextlib.AbstractContextManager["Live"]):
 
     def _ask(self, name: str, question: bytes, kind: type[T]) -> T:
         return msgspec.json.decode(self.bus.ask(name, question, ANSWER_SECONDS), type=kind)
+
+
+def recording_of(entry: Entry) -> Path:
+    """The file that a run writes, once something is in it: the run is listed before."""
+    path = Path(entry.recording)
+    while not (path.exists() and path.stat().st_size) and is_alive(entry):
+        time.sleep(POLL_SECONDS)
+    return path
 
 
 def wait_until_gone(entry: Entry) -> None:

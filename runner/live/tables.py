@@ -15,7 +15,6 @@ from runner.contract import EXIT_REFUSED, Refused
 from runner.graph.document import suggest
 from runner.inspect.echo import lines_of
 from runner.inspect.info import byte_count, seconds, table
-from runner.inspect.logs import printed_lines
 from runner.live.live import Header
 from runner.message.codec import LogLine
 from runner.supervise.calls import CommandType, Progress
@@ -102,26 +101,21 @@ def bandwidth_text(headers: Sequence[Header]) -> str:
 
 
 def _times(headers: Sequence[Header]) -> list[int]:
-    """When messages were sent; when they arrived, where a sender has another clock."""
-    sent = [header.sent_ns for header in headers]
+    """When messages were sent, in this order; when they arrived, where a sender has another clock."""
+    sent = sorted(header.sent_ns for header in headers)
     return sent if all(sent) else [header.arrived_ns for header in headers]
 
 
 # ------------------------------------------------------------------------------------------ log lines, calls
 
 
-def show_lines(recording: Path, lines: Iterable[LogLine], stage: str | None) -> None:
-    """Prints log lines as they come, with the time since the start of the run."""
-    terminal, began = Terminal(sys.stdout), _began(recording)
-    seen: set[str] = set()
+def show_lines(recording: Path, lines: Iterable[LogLine]) -> None:
+    """Prints log lines as they come and somebody reads them, with the time since the start of the run."""
+    terminal, began = Terminal(sys.stdout, needs_reader=True), _began(recording)
     for line in lines:
-        seen.add(line.stage)
-        if stage in (None, line.stage):
-            began = began or line.time_ns
-            name = f"{line.stage}.{line.replica}" if line.replica else line.stage
-            terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
-    if stage is not None and stage not in seen and not any(printed_lines(recording, stage)):
-        raise Refused(f"{recording}: nothing from a stage {stage!r}{suggest(stage, seen)}")
+        began = began or line.time_ns
+        name = f"{line.stage}.{line.replica}" if line.replica else line.stage
+        terminal.show(name, line.text, line.level, seconds=(line.time_ns - began) * 1e-9)
 
 
 def _began(recording: Path) -> int:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from itertools import repeat
 from types import UnionType
@@ -128,8 +128,13 @@ class Journal(msgspec.Struct, frozen=True):
     """What the recorder has of one stage, in its order."""
 
     steps: tuple[Step, ...] = ()
-    answered: tuple[tuple[str, IdText], ...] = ()
-    """(port, message id) that the stage had done with before the recorder had the message."""
+    answered: tuple[tuple[int, str, IdText], ...] = ()
+    """(replica, port, message id) that the stage had done with before the recorder had the message; -1: whichever."""
+
+    def done(self) -> Iterator[tuple[int, tuple[tuple[str, str], ...]]]:
+        """What each replica has done with, (port, message id)."""
+        yield from ((replica, ((port, id),)) for replica, port, id in self.answered)
+        yield from ((step.replica, answered(step)) for step in self.steps)
 
 
 class Deal(msgspec.Struct, frozen=True):

@@ -216,6 +216,12 @@ def print_where_it_crashes() -> None:
     faulthandler.register(DUMP, all_threads=False)
 
 
+def last_words(text: str) -> None:
+    """Prints why this process ends, which it does in the same way where its log is on a full disk."""
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
+
+
 def prefer_for_oom_kill() -> None:
     """Makes this process the kernel's choice when memory runs out."""
     with contextlib.suppress(OSError):

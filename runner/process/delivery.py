@@ -33,6 +33,8 @@ class Outgoing:
         self.route = route
         self.unanswered: OrderedDict[str, str] = OrderedDict()
         """Messages that the consumer has not done with: lineage by id."""
+        self._awaited: dict[str, set[int]] = {}
+        """Which replicas have not, by id; -1 where one of them is enough."""
         self._holders: dict[str, int] = {}
         """Which replica holds a part, by id."""
         self._live: set[int] = set()
@@ -48,11 +50,17 @@ class Outgoing:
         """Takes note of a message that is about to be sent."""
         if self.route.policy == "block":
             self.unanswered[message_id] = lineage
+            # What is kept for parts is put aside late by a replica that gets none of them, and their queue holds back.
+            self._awaited[message_id] = {-1} if self.route.kept else set(self.route.takers)
 
-    def answered(self, message_id: str) -> None:
-        """Lets go of a message that the consumer has done with."""
-        self.unanswered.pop(message_id, None)
-        self._holders.pop(message_id, None)
+    def answered(self, message_id: str, replica: int) -> None:
+        """Lets go of a message once all have done with it that must."""
+        awaited = self._awaited.get(message_id, set())
+        awaited -= {replica, -1}
+        if not awaited:
+            self.unanswered.pop(message_id, None)
+            self._awaited.pop(message_id, None)
+            self._holders.pop(message_id, None)
 
     def appeared(self, replica: int) -> None:
         """Takes note of a new process of the consumer, which holds nothing yet."""
@@ -132,12 +140,12 @@ class Delivery:
                         edge.note(message_id, "")  # one lineage all together: they may wait for what is still to come
         self._to_deal.set()
 
-    def answered(self, consumer: str, done: Iterable[tuple[str, str]]) -> None:
-        """Takes note that a consumer has done with (port, message id) pairs."""
+    def answered(self, consumer: str, replica: int, done: Iterable[tuple[str, str]]) -> None:
+        """Takes note that a replica of a consumer, -1 for whichever, has done with (port, message id) pairs."""
         with self._changed:
             for port, message_id in done:
                 for edge in self._edges_to(consumer, port):
-                    edge.answered(message_id)
+                    edge.answered(message_id, replica)
             self._changed.notify_all()
         self._to_deal.set()
 

@@ -22,7 +22,7 @@ from runner.graph.graph import SUPERVISOR
 from runner.message.codec import CaughtUp, CodecError, Envelope, Journal, LogLine, Lost, Step, pack
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import die_with_parent, is_orphan, print_where_it_crashes
+from runner.process.children import die_with_parent, is_orphan, last_words, print_where_it_crashes
 from runner.process.health import Heartbeat
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Completeness
@@ -141,9 +141,9 @@ class Recorder:
         try:
             work()
         except BaseException as error:
-            traceback.print_exc()
             self._writer.note_problem(f"the recorder failed: {type(error).__name__}: {error}".removesuffix(": "))
             self.stop()
+            last_words(traceback.format_exc())
 
     # ------------------------------------------------------------------------------------------ what is heard
 
@@ -196,8 +196,8 @@ class Recorder:
         topic = packet.key.partition("/")[2]
         if not self._manifest.steps_only:
             self._writer.put(envelope, packet.payload)
-        for consumer, port in self._redelivery.note_message(topic, envelope, packet.payload):
-            self._say(f"j/{consumer}", pack(Journal(answered=((port, envelope.id),))))
+        for consumer, taker, port in self._redelivery.note_message(topic, envelope, packet.payload):
+            self._say(f"j/{consumer}", pack(Journal(answered=((taker, port, envelope.id),))))
 
     def _on_step(self, step: Step, packet: Packet) -> None:
         """Refuses what a process says that is dead: the others know it as lost, and do its work again."""
@@ -275,12 +275,12 @@ def main() -> int:
     try:
         recorder = Recorder(manifest)
     except Refused as refusal:
-        print(refusal, file=sys.stderr, flush=True)
+        last_words(str(refusal))
         return EXIT_REFUSED
     signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
     signal.signal(ORPHANED, lambda *_: recorder.stop(orphaned=True))
     verdict = recorder.run()
-    print(f"{manifest.path}: {verdict}", file=sys.stderr, flush=True)
+    last_words(f"{manifest.path}: {verdict}")
     return 0 if verdict.complete or manifest.steps_only else EXIT_INCOMPLETE
 
 

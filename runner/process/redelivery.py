@@ -78,8 +78,8 @@ class Redelivery:
         self._early = Recent[tuple[str, int, str, str], None]()
         """(stage, taker, port, id) done with before it came: its publisher's link is the slower one."""
 
-    def note_message(self, topic: str, message: Envelope, payload: bytes) -> Iterator[tuple[str, str]]:
-        """Takes a message that has come; yields (stage, port) of consumers that had done with it already.
+    def note_message(self, topic: str, message: Envelope, payload: bytes) -> Iterator[tuple[str, int, str]]:
+        """Takes a message that has come; yields (stage, taker, port) of consumers that had done with it already.
 
         Its publisher has died meanwhile and its successor, which has sent it once more, does not know that.
         """
@@ -93,7 +93,7 @@ class Redelivery:
             early = (*place, id) in self._early
             self._early.pop((*place, id), None)
             if early or (known and id not in waiting.messages):
-                yield place[0], place[2]
+                yield place
             elif not known:
                 waiting.add(arrived)
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import math
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 
@@ -21,11 +22,11 @@ from runner.graph.placement import Network
 from runner.graph.ports import Handler
 from runner.graph.reading import node_from_entry
 from runner.message import codec
-from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, Step, answered
+from runner.message.codec import CaughtUp, Deal, Draft, Journal, Lost, Outcome, Step
 from runner.message.ids import MessageId
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import die_with_parent, prefer_for_oom_kill, print_where_it_crashes
+from runner.process.children import die_with_parent, last_words, prefer_for_oom_kill, print_where_it_crashes
 from runner.process.delivery import Delivery, Stopped
 from runner.process.forks import EXIT_FAILED
 from runner.process.health import Heartbeat
@@ -36,12 +37,22 @@ from runner.process.step import Executor, step_time
 from runner.recording.recording import Recording
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
+from runner.transport.vital import vital_thread
 
 SWITCH_SECONDS = 0.0005
 """How long one thread may keep the interpreter: a message waits for it on its way to the handler."""
 CATCH_UP_SECONDS = 0.005
 RECORDED_SECONDS = 1.0
 """How long it may take at the end until the recorder says that it has a step."""
+
+LOOK_SECONDS = 0.25
+STANDSTILL_SECONDS = 1.0
+"""Between two looks, or the process has stood still."""
+CUT_OFF_SECONDS = 10.0
+"""How long the supervisor may take to say that a process is dead that has gone: links to a machine that is cut off are
+not given up at the same moment."""
+FIRST_SECONDS = 2.0
+"""The same for who has stood still itself."""
 
 
 class Assignment(msgspec.Struct, frozen=True):
@@ -168,6 +179,8 @@ class StageProcess:
         self._bus.hand_over("e/**", self._refusals.naming(self._presence.ended))
         self._bus.subscribe("x/*", self._refusals.reading(Lost, self._on_lost))
         self._bus.watch(self._on_presence)
+        if self._may_be_cut_off:
+            vital_thread("cut off", self._end_when_cut_off).start()
         self._heartbeat.start()
         self._bus.announce()
 
@@ -185,13 +198,33 @@ class StageProcess:
     def _on_presence(self, process: Process, present: bool) -> None:
         own = self._process
         if present and process > own and process.place == own.place:
-            print(f"cut off meanwhile, and replaced by incarnation {process.incarnation}", file=sys.stderr, flush=True)
-            os._exit(EXIT_FAILED)
+            _end_at_once(f"cut off meanwhile, and replaced by incarnation {process.incarnation}")
+        if not present and process.stage == RECORDER and self._may_be_cut_off and not self._stopping.is_set():
+            _end_at_once("cut off from the recorder")  # before it has a step and lacks the one before
         self._presence.update(process, present)
         if present:
             self._delivery.appeared(process)
             if process.incarnation and any(route.consumer == process.stage for route in self._task.routes):
                 self._bus.publish(f"knows/{process.path}", own.path.encode())
+
+    @property
+    def _may_be_cut_off(self) -> bool:
+        """Whether links are given up while both ends live."""
+        return self._task.network is not None and self._task.network.credentials is not None
+
+    def _end_when_cut_off(self) -> None:
+        """Ends this process where another that it hears or feeds has gone for it alone: what was sent meanwhile is lost
+        until one of the two is replaced. Who has stood still goes first, who is not replaced last."""
+        others = {edge.stage for edge in self._node.inputs.values()} | {route.consumer for route in self._task.routes}
+        looked, stood_still = time.monotonic(), -math.inf
+        while not self._stopping.wait(LOOK_SECONDS):
+            before, looked = looked, time.monotonic()
+            if looked - before > STANDSTILL_SECONDS:
+                stood_still = looked
+            first = looked - stood_still < CUT_OFF_SECONDS
+            patience = 2 * CUT_OFF_SECONDS if not self._node.restarts else FIRST_SECONDS if first else CUT_OFF_SECONDS
+            if cut_off := self._presence.cut_off(others, patience):
+                _end_at_once(f"cut off from {', '.join(f'{one.stage}.{one.replica}' for one in cut_off)}")
 
     def _on_caught_up(self, caught_up: CaughtUp, _: Packet) -> None:
         self._delivery.take_over(caught_up.undone)
@@ -206,8 +239,8 @@ class StageProcess:
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
         """What a step has done with is acknowledged by it, once the recorder has the step."""
         consumer = packet.end
-        for done in (journal.answered, *map(answered, journal.steps)):
-            self._delivery.answered(consumer, done)
+        for replica, done in journal.done():
+            self._delivery.answered(consumer, replica, done)
             if consumer == self._process.stage:
                 self._intake.forget(done)
         own = [step for step in journal.steps if step.process == self._process]
@@ -393,6 +426,12 @@ class _Record:
         )
 
 
+def _end_at_once(reason: str) -> NoReturn:
+    """Ends this process from any of its threads; another takes its place."""
+    last_words(reason)
+    os._exit(EXIT_FAILED)
+
+
 def _summary(error: BaseException) -> str:
     """An exception in one line: its type, its text and where it was raised."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
@@ -429,17 +468,13 @@ def main() -> int:
         signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
     except Refused as refusal:
-        code = _fail(str(refusal), EXIT_REFUSED)
+        code = EXIT_REFUSED
+        last_words(str(refusal))
     except BaseException as error:
-        traceback.print_exc()
-        code = _fail(_summary(error), EXIT_FAILED)
+        code = EXIT_FAILED
+        last_words(f"{traceback.format_exc()}{_summary(error)}")
     if process is not None:
         process.close(failed=code != 0)
-    return code
-
-
-def _fail(reason: str, code: int) -> int:
-    print(reason, file=sys.stderr, flush=True)
     return code
 
 

@@ -209,8 +209,12 @@ def new_file(path: Path) -> Generator[IO[bytes]]:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Recordings, the one that was written last first."""
-    return sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
+    """Recordings, the one that was written last first; without what is not there, as the end of a dead link."""
+    written: dict[Path, float] = {}
+    for path in folder.glob("*.mcap"):
+        with contextlib.suppress(OSError):
+            written[path] = path.stat().st_mtime
+    return sorted(written, key=written.__getitem__, reverse=True)
 
 
 def _beside(folder: Path) -> str:

@@ -120,7 +120,7 @@ def opened(graph: Graph, sealed: Envelope) -> Message | None:
         raise Refused(f"{sealed.id} cannot be read: {error}") from None
 
 
-def _decoded(text: str, kind: type[T]) -> T:
+def decoded(text: str, kind: type[T]) -> T:
     """What a JSON text holds; nothing (``kind()``) where it is none or of another type."""
     try:
         return msgspec.convert(json.loads(text), kind)
@@ -184,13 +184,19 @@ class Recording:
 
     def aspect(self, name: str, default: T) -> T:
         """One JSON text of :attr:`run`, or the default where it is absent, unreadable or of another type."""
-        return _decoded(self.run.get(name, ""), type(default)) or default
+        return decoded(self.run.get(name, ""), type(default)) or default
+
+    @property
+    def lasted_ns(self) -> int:
+        """From the first record to the last, as the recorder received them."""
+        times = [time_ns for _, time_ns, *_ in self._order]
+        return max(times, default=0) - min(times, default=0)
 
     @cached_property
     def verdict(self) -> Completeness:
         """What was written, as far as the content proves it: COMPLETE only where both say so."""
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
-        counts = _decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
+        counts = decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason, run = self._breakage or written.get("reason", ""), written.get("run", "")
         if self._steps_only:
             return Completeness(False, (), reason, counts, run)
@@ -295,7 +301,7 @@ class Recording:
     def require_messages(self) -> None:
         """Raises Refused where the run was asked to record none."""
         if self._steps_only:
-            raise Refused(f"{self.path}: holds no messages (runner up --steps-only): no stage can be executed again")
+            raise Refused(f"{self.path}: holds no messages (runner up --steps-only)")
 
     @property
     def _steps_only(self) -> bool:
@@ -315,12 +321,12 @@ class Recording:
         """Whether it says how processes ended, which the first recordings did not."""
         if "format" in self.run or "counts" in self.metadata.get(VERDICT, {}) or self.lost:
             return True
-        return any(isinstance(record, Step) and record.outcome == "ended" for _, _, record, _ in self._order)
+        return any(isinstance(record, Step) and record.outcome == "ended" for _, _, record, *_ in self._order)
 
     def _prove(self) -> Proof:
         proof = Proof(self.graph)
         for entry in self._order:
             proof.enter(*entry)
-        for id in _decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
+        for id in decoded(self.metadata.get(VERDICT, {}).get("missing", ""), list[IdText]):
             proof.want(id)
         return proof

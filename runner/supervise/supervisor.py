@@ -23,7 +23,7 @@ from runner.hosts.head import Hosts
 from runner.inspect.info import StageTimes
 from runner.inspect.skipped import Skipped
 from runner.message import codec
-from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step, answered
+from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, Outcome, Pulse, Step
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery, Stopped
@@ -157,9 +157,9 @@ class Supervisor:
         self._bus.watch(self._on_presence, self._refusals.refuse)
 
     def _on_journal(self, journal: Journal, packet: Packet) -> None:
-        self._delivery.answered(packet.end, journal.answered)
+        for replica, done in journal.done():
+            self._delivery.answered(packet.end, replica, done)
         for step in journal.steps:
-            self._delivery.answered(step.stage, answered(step))
             if step.stage in self._graph.nodes:
                 self._guardian.note_step(step)
                 self._times.note(step)

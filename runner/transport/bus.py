@@ -83,7 +83,7 @@ class Bus:
         self._far = network is not None
         calls = [*([] if listen else [endpoint]), *filter(None, [self._gateway])]
         if client or (network is not None and network.routed):
-            self._session = open_session([], calls, network, mode="client")
+            self._session = open_session([], calls, network, mode="client", calls_once=client)
         else:
             own = endpoint if listen else new_endpoint(endpoint) if network is None else private(network.listen)
             self._session = open_session([own], calls, network)

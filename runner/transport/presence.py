@@ -1,6 +1,7 @@
 """Which processes of a run are there, and which publish no more."""
 
 import threading
+import time
 from collections.abc import Callable, Collection, Iterable
 
 from runner.graph.graph import SUPERVISOR
@@ -18,6 +19,8 @@ class Presence:
         self._newest: dict[tuple[str, int], int] = {}
         self._ended: dict[tuple[str, int], int] = {}
         """Incarnation by (stage, replica)."""
+        self._gone: dict[Process, float] = {}
+        """When each was seen to go first, monotonic seconds."""
         self._changed = threading.Condition()
 
     def update(self, process: Process, present: bool) -> None:
@@ -25,6 +28,8 @@ class Presence:
         with self._changed:
             self.living = self.living | {process} if present else self.living - {process}
             _raise(self._newest, process)
+            if not present:
+                self._gone.setdefault(process, time.monotonic())
             self._changed.notify_all()
 
     def ended(self, process: Process) -> None:
@@ -48,6 +53,16 @@ class Presence:
         wanted = {place for place in (*processes, (SUPERVISOR, 0)) if place[0] in stages}
         with self._changed:
             self._changed.wait_for(lambda: all(map(self._has_ended, wanted)), END_SECONDS)
+
+    def cut_off(self, stages: Collection[str], seconds: float) -> list[Process]:
+        """The newest processes of these stages that have gone so long ago and are not known to publish no more. They
+        may be back: what was sent meanwhile is lost."""
+        before = time.monotonic() - seconds
+        with self._changed:
+            gone = [one for one, at in self._gone.items() if one.stage in stages and at < before]
+            return [
+                one for one in gone if self._newest[one.place] == one.incarnation and not self._has_ended(one.place)
+            ]
 
     def _has_ended(self, place: tuple[str, int]) -> bool:
         return self._ended.get(place, -1) >= self._newest.get(place, 0)

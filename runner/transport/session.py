@@ -29,8 +29,14 @@ from runner.transport.security import readers_only, security
 
 LEASE_MS = 5000
 """A host of which nothing is heard for so long is cut off."""
-PATIENT_LEASE_MS = 7 * 24 * 3600 * 1000
-"""On one machine: a socket tells at once when a process has died, and one that is stopped for a while has not."""
+PATIENCE = {
+    "transport/link/tx/lease": 7 * 24 * 3600 * 1000,
+    "transport/unicast/open_timeout": 600_000,
+    "transport/unicast/accept_timeout": 600_000,
+}
+"""On one machine, milliseconds: a socket tells at once when a process has died, and one that is stopped for a while has
+not. Zenoh would give up a link that is being made after 10 s, and two processes that one names to the other never try
+again."""
 BLOCK_FOR_US = 600_000_000
 """How long a full link blocks its sender before Zenoh gives the link up; the default of 5 s loses messages."""
 CALL_MS = 10_000
@@ -117,6 +123,8 @@ class Gateway:
             "scouting/gossip/enabled": network is not None,
             "qos/network": [{**dropped, "overwrite": {"congestion_control": "drop"}}],
             "transport/link/tx/queue/size": queue,
+            # Few may be coming in at a time: a stranger who calls and says nothing keeps nobody out for long.
+            "transport/unicast/accept_timeout": CALL_MS,
         }
         settings |= readers_only(network, public)
         self._session = open_session(listen, [meeting], network, mode=mode, settings=settings)
@@ -136,15 +144,16 @@ def open_session(
     network: Network | None = None,
     *,
     mode: str = "peer",
+    calls_once: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
-    """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes a client."""
-    calls_once = mode == "client" and not (network is not None and network.routed)
+    """Opens a session; raises Refused where this machine cannot listen as it is told, or nobody takes the call of one
+    who ``calls_once``."""
     told: dict[str, Any] = {
         "mode": mode,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        # A router may be started after those that call it.
+        # A router may be started after those that call it, and whoever is called may stand still.
         "connect/timeout_ms": CALL_MS if calls_once else -1,
         "connect/exit_on_failure": calls_once,
         "scouting/multicast/enabled": False,
@@ -153,10 +162,11 @@ def open_session(
         # not; what a process reads that stands still is overwritten. See docs/runner/performance.md.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCK_FOR_US,
-        "transport/link/tx/lease": PATIENT_LEASE_MS if network is None or network.credentials is None else LEASE_MS,
     }
     if network is not None and network.credentials is not None:
-        told |= security(network, network.credentials)
+        told |= {"transport/link/tx/lease": LEASE_MS, **security(network, network.credentials)}
+    else:
+        told |= PATIENCE
     config = zenoh.Config()
     for key, value in {**told, **(settings or {})}.items():
         config.insert_json5(key, json.dumps(value))

@@ -15,8 +15,10 @@ def vital_thread(name: str, work: Callable[[], None]) -> threading.Thread:
         try:
             work()
         except BaseException:
-            traceback.print_exc()
-            sys.stderr.flush()
-            os._exit(1)
+            try:
+                traceback.print_exc()
+                sys.stderr.flush()
+            finally:  # also where the log is on a full disk
+                os._exit(1)
 
     return threading.Thread(target=run, name=name, daemon=True)

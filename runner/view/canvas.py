@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from runner.graph.reading import graph_from_json
 from runner.message.codec import Envelope
 from runner.view import drawing as d
-from runner.view.views import drawn, load_views
+from runner.view.views import drawn, leaving_out, load_views
 
 STEP = "step"
 TIME = "time"
@@ -52,9 +52,10 @@ class Canvas:
                 self._put(drawing)
 
     def _put(self, drawing: d.Drawing, *, static: bool = False) -> None:
-        found = _ARCHETYPES[type(drawing)](drawing)
-        for archetype in found if isinstance(found, list) else [found]:
-            self._stream.log(drawing.path, archetype, static=static)
+        with leaving_out(drawing.path):
+            found = _ARCHETYPES[type(drawing)](drawing)
+            for archetype in found if isinstance(found, list) else [found]:
+                self._stream.log(drawing.path, archetype, static=static)
 
 
 def _depth(depth: d.DepthImage) -> rr.DepthImage:

@@ -25,7 +25,7 @@ from runner.message.codec import LogLine
 from runner.recording.container import new_file
 from runner.recording.recording import Recording
 from runner.view import drawing as d
-from runner.view.views import drawn, load_views
+from runner.view.views import drawn, leaving_out, load_views
 
 STEP_NS = 33_000_000
 """Between the steps of an animation."""
@@ -76,17 +76,20 @@ class _Sink:
     def __init__(self, writer: Writer) -> None:
         self.counts: Counter[str] = Counter()
         self._writer = writer
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        """By topic and kind of message."""
         writer.start(profile="", library="scene-programming")
 
     def put(self, written: Iterable[Written], time_ns: int) -> None:
         for topic, message in written:
             plain = isinstance(message, dict)
-            if topic not in self._channels:
-                self._channels[topic] = self._register(topic, message)
+            kind = "JSON" if plain else type(message).__name__
+            if (topic, kind) not in self._channels:
+                taken = any(other == topic for other, _ in self._channels)
+                self._channels[topic, kind] = self._register(f"{topic}.{kind}" if taken else topic, message)
             data = json.dumps(message).encode() if plain else message.encode()
-            self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
-            self.counts["JSON" if plain else type(message).__name__] += 1
+            self._writer.add_message(self._channels[topic, kind], time_ns, data, time_ns)
+            self.counts[kind] += 1
 
     def _register(self, topic: str, message: Any) -> int:
         if isinstance(message, dict):
@@ -112,8 +115,10 @@ class _Scribe:
             if isinstance(drawing, d.Clear):
                 yield from self._cleared(_clean(drawing), now)
             else:
-                self._standing[_clean(drawing)] = drawing
-                yield self._one(drawing, now)
+                with leaving_out(drawing.path):
+                    written = self._one(drawing, now)
+                    self._standing[_clean(drawing)] = drawing
+                    yield written
 
     def _one(self, drawing: d.Drawing, now: int) -> Written:
         path = _clean(drawing)
@@ -279,7 +284,12 @@ def _graph(graph: d.Graph, _: str, __: Head) -> dict[str, Any]:
 
 
 def _scalar(scalar: d.Scalar, path: str, _: Head) -> dict[str, Any]:
-    return {"name": scalar.name or path.rpartition("/")[2], "value": scalar.value}
+    return {"name": scalar.name or path.rpartition("/")[2], "value": _number(scalar.value)}
+
+
+def _number(value: float) -> float | None:
+    """As JSON has it, which knows no others than finite ones."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _color(color: Sequence[int]) -> fox.Color:
@@ -310,6 +320,6 @@ _MESSAGES: dict[type, Callable[[Any, str, Head], Any]] = {
     d.Text: _text,
     d.Graph: _graph,
     d.Scalar: _scalar,
-    d.BarChart: lambda bars, *_: {"values": np.asarray(bars.values, np.float64).tolist()},
+    d.BarChart: lambda bars, *_: {"values": [_number(value) for value in bars.values]},
 }
 """By drawing: makes a Foxglove message, or a dict, of it, its path and its head."""

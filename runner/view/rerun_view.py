@@ -35,6 +35,7 @@ WINDOW = (1280, 800)
 """Size of the window of a picture, in points of two pixels."""
 PACKAGES = "xvfb mesa-vulkan-drivers libxkbcommon-x11-0 libxcursor1 libxi6 libxrandr2"
 SCREENSHOT_SECONDS = 120
+STDOUT = Path("-")
 
 
 # ------------------------------------------------------------------------------------ recordings
@@ -75,8 +76,10 @@ def _stream(path: Path) -> rr.RecordingStream:
 
 
 def _write(stream: rr.RecordingStream, target: Path) -> None:
+    if target.exists():
+        raise Refused(f"{target}: cannot be written: File exists")
     try:
-        stream.stdout() if target == Path("-") else stream.save(target)
+        stream.stdout() if target == STDOUT else stream.save(target)
     except RuntimeError as error:
         raise Refused(f"{target}: cannot be written: {error}") from None
 
@@ -111,7 +114,7 @@ def view_live(path: Path | None = None, save: Path | None = None) -> None:
 def newest_live(folder: Path) -> Path:
     """The newest recording that a running graph writes; raises Refused where there is none."""
     for path in recordings_in(folder):
-        with path.open("rb") as file:
+        with contextlib.suppress(OSError), path.open("rb") as file:  # another user's, or gone
             if is_being_written(file):
                 return path
     raise Refused(f"{folder}: no graph is running here: no recording is being written")
@@ -174,21 +177,28 @@ def _free_port() -> int:
 
 
 def screenshot(rrd: Path, png: Path) -> None:
-    """Renders the last state of a Rerun file without a display; raises Refused where tools are missing."""
+    """Renders the last state of a Rerun file without a display; raises Refused where tools are missing.
+
+    An older picture is replaced once there is a new one.
+    """
     size = "x".join(map(str, WINDOW))
-    command = [RERUN, "--bind", "127.0.0.1", "--port", str(_free_port())]
-    command += ["--window-size", size, "--screenshot-to", str(png.absolute()), str(rrd.absolute())]
-    try:
-        png.unlink(missing_ok=True)
-    except OSError as error:
-        raise Refused(f"{png}: cannot be written: {error.strerror}") from None
     with _virtual_display(size) as display, tempfile.TemporaryDirectory() as runtime:
+        rendered, part = Path(runtime) / png.name, png.with_name(f"{png.name}.part")
+        command = [RERUN, "--bind", "127.0.0.1", "--port", str(_free_port())]
+        command += ["--window-size", size, "--screenshot-to", str(rendered), str(rrd.absolute())]
         settings = {"WGPU_BACKEND": "vulkan", "XDG_RUNTIME_DIR": runtime}
         environment = {**os.environ, **settings, "DISPLAY": display}
         with contextlib.suppress(subprocess.TimeoutExpired):
             subprocess.run(command, env=environment, capture_output=True, timeout=SCREENSHOT_SECONDS, check=False)
-    if not png.exists():
-        raise Refused(f"{png}: the viewer could not render; it needs: apt-get install {PACKAGES}")
+        if not rendered.exists():
+            raise Refused(f"{png}: the viewer could not render; it needs: apt-get install {PACKAGES}")
+        try:
+            shutil.copyfile(rendered, part)
+            part.replace(png)
+        except OSError as error:
+            raise Refused(f"{png}: cannot be written: {error.strerror}") from None
+        finally:
+            part.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Generator
 from importlib.util import find_spec
 
 from runner.contract import Refused
@@ -26,17 +28,24 @@ def require_viewer() -> None:
 def drawn(graph: Graph, views: Views, sealed: Envelope) -> list[list[Drawing]]:
     """What one message shows, step by step; what cannot be drawn is named on stderr and left out."""
     steps: list[list[Drawing]] = [[]]
-    try:
+    with leaving_out(sealed.id):
         if (kind := kind_of(graph, sealed.id)) is not None:
             for drawing in views.draw(open_envelope(kind, sealed)):
                 if isinstance(drawing, NextStep):
                     steps.append([])
                 else:
                     steps[-1].append(drawing)
-    except Exception as error:  # the rest of the recording is still worth seeing
-        reason = str(error).partition("\n")[0]
-        print(f"{sealed.id} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
     return steps
+
+
+@contextlib.contextmanager
+def leaving_out(what: str) -> Generator[None]:
+    """Names on stderr what cannot be drawn: the rest of the recording is still worth seeing."""
+    try:
+        yield
+    except Exception as error:
+        reason = str(error).partition("\n")[0]
+        print(f"{what} cannot be drawn: {type(error).__name__}: {reason}", file=sys.stderr)
 
 
 def load_views(graph: Graph) -> Views:

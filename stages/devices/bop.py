@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from runner.contract import Refused
+from stages.geometry.camera import checked_intrinsics
 from stages.messages.arrays import Depth, Intrinsics, Rgb
 
 TARGETS = "test_targets_bop19.json"
@@ -91,7 +92,10 @@ def _image(dataset: Path, key: tuple[int, int], n_objects: int, cameras: dict[st
     depth = _existing([scene / "depth" / f"{name}.png"], "depth")
     if _size(rgb) != _size(depth):
         raise Refused(f"{depth}: {_shown(_size(depth))} pixels, but the colour image has {_shown(_size(rgb))}")
-    K = np.array(view.cam_K, np.float64).reshape(3, 3)
+    try:
+        K = checked_intrinsics(np.array(view.cam_K, np.float64).reshape(3, 3))
+    except ValueError as error:
+        raise Refused(f"{scene / 'scene_camera.json'}: image {image_id}: cam_K: {error}") from None
     return BopImage(scene_id, image_id, n_objects, rgb, depth, K, view.depth_scale)
 
 

@@ -23,6 +23,7 @@ class Detection:
     image_id: int
     label: str
     score: float
+    """From 0 to 1."""
     box: NDArray[np.float64]
     """x0, y0, x1, y1 in pixels."""
 
@@ -54,7 +55,9 @@ def read_detections(path: Path, names: Mapping[int, str]) -> Iterator[Detection]
             known = ", ".join(str(category) for category in sorted(names))
             raise Refused(f"{path}: entry {number}: category_id {entry.category_id} is none of {known}")
         x, y, width, height = entry.bbox
-        if not math.isfinite(x + y + width + height + entry.score):
+        if not math.isfinite(x + y + width + height):
             raise Refused(f"{path}: entry {number}: numbers must be finite")
+        if not 0 <= entry.score <= 1:
+            raise Refused(f"{path}: entry {number}: score {entry.score:g} must lie from 0 to 1")
         box = np.array([x, y, x + width, y + height])
         yield Detection(entry.scene_id, entry.image_id, names[entry.category_id], entry.score, box)

@@ -10,10 +10,25 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.messages.arrays import Depth, Intrinsics
 
+_SKEWED = 1e-3
+"""Pixels by which an entry of K may be off where a pinhole camera has 0 or 1."""
+
 
 def intrinsics(focal: float, width: int, height: int) -> Intrinsics:
     """K (3 x 3) of an ideal camera whose axis passes through the middle of the image."""
     return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def checked_intrinsics(K: Floats) -> Intrinsics:
+    """K (3 x 3) as it is given.
+
+    Raises:
+        ValueError: it has skew, a last row other than 0 0 1, or no focal length.
+    """
+    pinhole = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
+    if not (np.abs(K - pinhole).max() < _SKEWED and pinhole.diagonal().min() > 0):
+        raise ValueError(f"K = {K.tolist()}: must be fx 0 cx, 0 fy cy, 0 0 1 with fx and fy above 0 and without skew")
+    return K
 
 
 def rays(K: Intrinsics, height: int, width: int) -> Floats:

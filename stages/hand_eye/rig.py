@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -70,6 +70,12 @@ class Rig:
         links = self.robot.body.link_poses(tuple(joints), np.array(list(joints.values())))
         here = {"": np.eye(4), **links}
         return inverse(here[self.robot.camera.link]) @ here[self.link]
+
+    def unread(self, joint_names: Sequence[str]) -> list[str]:
+        """The joints that stand still between camera and board and are not among those named."""
+        home, still = self.between({}), self.robot.still.items()
+        left = {name: self.between({name: position + 0.1}) for name, position in still if name not in joint_names}
+        return [name for name, A in left.items() if not np.allclose(A, home, atol=1e-9)]
 
     def with_board(self, Y: Floats, *, clearance: float = 0.0) -> Robot:
         """The robot with the board at ``Y`` (T_boardlink_board), its plate larger by ``clearance`` metres."""

@@ -53,6 +53,8 @@ class CalibrationRoutine:
         postures = proposed(self._rig, self._world, Sightlines(self._robot), self._poses, rng)
         holder = f"held by {self._rig.link}" if self._rig.held else "in the room"
         self._log(f"{len(postures)} poses proposed, the board {holder}")
+        if unread := self._rig.unread(state.joint_names):
+            self._log(f"no encoder of {', '.join(unread)} is read: taken to stand where the description says")
         for number, q in enumerate(nearest_first(postures, at), 1):
             path = free_motion(self._world, at, q, rng)
             if path is None:
@@ -66,14 +68,14 @@ class CalibrationRoutine:
             state = yield self._read()
             if state.stopped:
                 return self.failure(_stands(state))
-            self._see(frame, arm(self._rig.robot, state), at, f"pose {number} of {len(postures)}")
+            self._see(frame, state, at, f"pose {number} of {len(postures)}")
         back = free_motion(self._world, at, self._rig.robot.home, rng)
         if back is not None:
             yield self._move(back, "go home")
         return self._result()
 
-    def _see(self, frame: Frame, at: Floats, before: Floats, place: str) -> None:
-        if np.abs(at - before).max() > _MOVED:
+    def _see(self, frame: Frame, state: RobotState, before: Floats, place: str) -> None:
+        if np.abs(arm(self._rig.robot, state) - before).max() > _MOVED:
             self._log(f"{place}: the arm moved while the picture was taken; left out")
             return
         found = self._rig.board.find(frame.rgb)
@@ -81,7 +83,7 @@ class CalibrationRoutine:
             self._log(f"{place}: no board in the picture")
             return
         ids, pixels = found
-        joints = dict(zip(self._rig.robot.joints, at.tolist(), strict=True))
+        joints = dict(zip(state.joint_names, state.positions.tolist(), strict=True))
         self._sights.append(Sight(self._rig.between(joints), self._rig.board.corners[ids], pixels, frame.K))
         self._log(f"{place}: {len(ids)} of {len(self._rig.board.corners)} corners")
 

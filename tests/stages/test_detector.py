@@ -203,10 +203,10 @@ def test_views_of_another_catalogue_are_refused(learned: Path) -> None:
             ModelDetector.Config(catalogue=CATALOGUE, **settings)
 
 
-def recorded(tmp_path: Path, entries: list[dict[str, Any]]) -> RecordedDetections:
+def recorded(tmp_path: Path, entries: list[dict[str, Any]], *, stride: int = 1) -> RecordedDetections:
     path = tmp_path / "detections.json"
     path.write_text(json.dumps(entries))
-    return RecordedDetections(RecordedDetections.Config(detections=path, catalogue=CATALOGUE))
+    return RecordedDetections(RecordedDetections.Config(detections=path, catalogue=CATALOGUE, stride=stride))
 
 
 def entry(**changes: Any) -> dict[str, Any]:
@@ -220,6 +220,20 @@ def test_recorded_detections_answer_each_image_in_file_order(tmp_path: Path) -> 
     assert [(one.label, one.confidence) for one in message.candidates] == [("cup", 0.5), ("tray", 0.9)]
     np.testing.assert_array_equal(message.candidates[0].box, [10, 20, 40, 60])
     np.testing.assert_array_equal(message.confidences.max(axis=1), [0.5, 0.9])
+
+
+def test_recorded_boxes_shrink_with_an_image_of_every_other_pixel(tmp_path: Path) -> None:
+    stage = recorded(tmp_path, [entry()], stride=2)
+    (message,) = run_stage(stage, [frame(np.zeros((4, 4, 3), np.uint8), scene_id=1, image_id=2)])
+    np.testing.assert_array_equal(message.candidates[0].box, [5, 10, 20, 30])
+    with pytest.raises(Refused, match=r"detector\.stride = 0: must be 1"):
+        recorded(tmp_path, [], stride=0)
+
+
+def test_a_recorded_label_holds_at_a_score_of_nothing(tmp_path: Path) -> None:
+    stage = recorded(tmp_path, [entry(score=0)])
+    (message,) = run_stage(stage, [frame(np.zeros((4, 4, 3), np.uint8), scene_id=1, image_id=2)])
+    assert [(one.label, one.confidence) for one in message.candidates] == [("cup", 0.0)]
 
 
 def test_an_image_that_the_file_lacks_is_empty_and_says_so(tmp_path: Path) -> None:

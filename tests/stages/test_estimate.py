@@ -106,6 +106,8 @@ def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
         estimate_scene(RGB, (1000 * depth).astype(np.uint16), K, CATALOGUE_FILE, boxes=given)  # type: ignore[arg-type]
     with pytest.raises(Refused, match=r"K is \(4,\); 3 x 3 is expected"):
         estimate_scene(RGB, depth, np.zeros(4), CATALOGUE_FILE, boxes=given)
+    with pytest.raises(Refused, match=r"K = .*: must be fx 0 cx, .* without skew"):
+        estimate_scene(RGB, depth, K + np.diag([2.0, 0], 1), CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match="'teapot' is not in the catalogue"):
         estimate_scene(RGB, depth, K, CATALOGUE_FILE, boxes=[("teapot", (0, 0, 9, 9))])
     with pytest.raises(Refused, match=r"box of mug: .* is not x0, y0, x1, y1 with x0 < x1"):

@@ -56,6 +56,11 @@ def test_one_setting_changes_the_catalogue_of_every_stage(name: str, stage: str)
     assert found == {Path("/ours.yaml")}
 
 
+def test_recorded_boxes_are_those_of_the_pixels_that_the_camera_gives() -> None:
+    path = ROOT / "graphs/bop.yaml"
+    assert load_graph(path, ("camera.stride=4", *_needed(path))).nodes["detector"].config.stride == 4
+
+
 def test_a_setting_within_a_group_is_filled_in() -> None:
     arm, wrong = ROOT / "graphs/arm.yaml", "ros2.frames.base=${camera.topics.bas_frame}"
     assert load_graph(arm, ("camera.topics.base_frame=map",)).nodes["ros2"].config.frames.base == "map"

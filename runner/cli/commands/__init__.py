@@ -10,6 +10,8 @@ from typing import Any
 
 Commands = Any
 """What argparse returns from ``add_subparsers``; it has no public type."""
+RECORDINGS = Path("recordings")
+"""Where runs are recorded where no other folder is named."""
 Command = Callable[[argparse.Namespace], int | None]
 """Runs with the parsed options and returns the exit status; None is 0."""
 
@@ -42,7 +44,7 @@ def add_file(parser: argparse.ArgumentParser) -> None:
 
 def add_recordings(parser: argparse.ArgumentParser, text: str) -> None:
     """Adds the folder of recordings; ``text`` says what for."""
-    parser.add_argument("--recordings", type=Path, default=Path("recordings"), metavar="DIR", help=text)
+    parser.add_argument("--recordings", type=Path, default=RECORDINGS, metavar="DIR", help=text)
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

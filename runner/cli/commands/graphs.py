@@ -155,8 +155,6 @@ def _schema(options: argparse.Namespace) -> None:
     if options.graph is None:
         described = graph_schema()
     else:
-        stages = load_graph(options.graph, options.settings).nodes.items()
-        described = {
-            f"{stage}/{port}": json_schema(kind) for stage, node in stages for port, kind in node.type.outputs.items()
-        }
+        topics = load_graph(options.graph, options.settings).topics()
+        described = {topic: json_schema(kind) for topic, kind in topics.items()}
     print(json.dumps(described, indent=2))

@@ -6,11 +6,10 @@ import argparse
 import os
 import shlex
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.cli import completion
-from runner.cli.commands import Commands, add, add_recordings, count, graph_file
+from runner.cli.commands import RECORDINGS, Commands, add, add_recordings, count, graph_file
 from runner.cli.completion import completed
 from runner.contract import Refused
 
@@ -30,7 +29,8 @@ def add_commands(commands: Commands) -> None:
     text = "only this one, with what its processes printed"
     completed(logs.add_argument("stage", metavar="STAGE", nargs="?", help=text), completion.stages)
     logs.add_argument("-f", "--follow", action="store_true", help="go on until the graph ends")
-    add_recordings(logs, "where the last run is")
+    add_recordings(logs, "where the last run is, whatever runs now")
+    logs.set_defaults(recordings=None)
     _add_run(logs)
 
     topic = commands.add_parser("topic", help="look at what flows", description="Look at what flows.")
@@ -67,7 +67,8 @@ def add_commands(commands: Commands) -> None:
 
 def _add_verbs(verbs: Commands) -> None:
     """What can be done with topics."""
-    _add_run(add(verbs, "list", _topic_list, "every topic with its type, its consumers and how much flows"))
+    text = "every topic with its type, its consumers and how much flows from the processes that live now"
+    _add_run(add(verbs, "list", _topic_list, text))
     for name, verb, text, unit in (
         ("echo", _topic_echo, "print messages as they come, whatever their type", "messages"),
         ("hz", _topic_rate, "how often messages come, from their headers alone", "lines, one a second"),
@@ -110,12 +111,15 @@ def _ps(options: argparse.Namespace) -> None:
 
 def _logs(options: argparse.Namespace) -> None:
     from runner.inspect.logs import log_lines, newest_recording, printed_lines
+    from runner.live.live import recording_of
     from runner.live.tables import show_lines
     from runner.supervise.registry import find_run, runs
 
-    running = bool(options.run) or bool(runs())
-    path = Path(find_run(options.run).recording) if running else newest_recording(options.recordings)
-    show_lines(path, log_lines(path, follow=options.follow), options.stage)
+    if options.run and options.recordings:
+        raise Refused("runner logs: --run NAME or --recordings DIR, not both")
+    running = options.run or (options.recordings is None and runs())
+    path = recording_of(find_run(options.run)) if running else newest_recording(options.recordings or RECORDINGS)
+    show_lines(path, log_lines(path, options.stage, follow=options.follow))
     if options.stage and not options.follow:
         for process, line in printed_lines(path, options.stage):
             print(f"{process} | {line}")
@@ -185,13 +189,14 @@ def _restart(options: argparse.Namespace) -> None:
 def _goals(options: argparse.Namespace) -> int | None:
     from runner.graph.document import suggest
     from runner.graph.reading import load_graph
+    from runner.live.live import recording_of
     from runner.page.watch import told_so_far, told_without_a_run
     from runner.supervise.registry import find_run
 
     if options.graph is not None:
         told = told_without_a_run(load_graph(options.graph), "en")
     else:
-        told = told_so_far(Path(find_run(options.run).recording), "en")
+        told = told_so_far(recording_of(find_run(options.run)), "en")
     titles = [card.title for card in told.cards]
     if options.name is not None and options.name not in titles:
         raise Refused(f"{options.name}: is not remembered{suggest(options.name, titles)}")

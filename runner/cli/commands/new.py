@@ -17,4 +17,4 @@ def _new(options: argparse.Namespace) -> None:
 
     for path in new_project(options.name, Path.cwd()):
         print(path.relative_to(Path.cwd()))
-    print(f"now: cd {options.name} && runner up graph.yaml && pytest")
+    print(f"now: cd {options.name} && runner up graph.yaml; its tests: pip install pytest && pytest")

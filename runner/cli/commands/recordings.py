@@ -54,8 +54,13 @@ def _view(options: argparse.Namespace) -> None:
     from runner.view.views import require_viewer
 
     require_viewer()
-    from runner.view.rerun_view import view_live, view_recording
+    from runner.view.rerun_view import STDOUT, view_live, view_recording
 
+    for option, path, suffix in (("--save", options.save, ".rrd"), ("--png", options.png, ".png")):
+        if path is not None and path.suffix != suffix and (option, path) != ("--save", STDOUT):
+            raise Refused(f"{option} {path}: must end in {suffix}")
+    if options.live and options.png:
+        raise Refused("runner view: --png shows a graph that has ended; with --live valid: --save")
     if options.live:
         view_live(options.file, options.save)
     elif options.file is None:

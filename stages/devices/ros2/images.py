@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.geometry.camera import checked_intrinsics
 from stages.geometry.lens import PLUMB_BOB, Lens
 from stages.messages.arrays import Depth, Intrinsics, Rgb
 
@@ -45,11 +46,12 @@ def depth(message: Any) -> Depth:
 
 
 def pinhole(info: Any, *, rectified: bool) -> Intrinsics:
-    """The matrix of a CameraInfo for images that are ``rectified`` or not; ValueError without a focal length."""
+    """The matrix of a CameraInfo for images that are ``rectified`` or not; ValueError without a focal length, or with
+    skew."""
     K = np.array(np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3)), np.float64)
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError("no focal length: the camera is not calibrated")
-    return K
+    return checked_intrinsics(K)
 
 
 def lens(info: Any, K: Intrinsics, *, rectified: bool) -> Lens:

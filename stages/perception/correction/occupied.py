@@ -9,6 +9,7 @@ import numpy as np
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
+from stages.geometry.regions import moved
 from stages.perception.observation.plane import find_plane, support_region
 from stages.perception.rendering.rasteriser import Float32s, View
 from stages.robots import Robot
@@ -43,8 +44,11 @@ def occupied(
         return None
     T_base_table = T_base_camera @ T_camera_table
     height = float(T_base_table[2, 3])
-    region = support_region(depth, view, T_camera_table) @ T_base_table[:2, :2].T + T_base_table[:2, 3]
-    low, high = region.min(0) - _MARGIN, region.max(0) + _MARGIN
+    region = support_region(depth, view, T_camera_table)
+    if region is None:
+        return None
+    corners = moved(region, T_base_table)
+    low, high = corners.min(0) - _MARGIN, corners.max(0) + _MARGIN
     points = (view.rays() * depth[..., None])[depth > 0] @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
     above = points[:, 2] - height
     on_it = (above > _LEAST) & (above < _TALLEST) & ((points[:, :2] > low) & (points[:, :2] < high)).all(1)

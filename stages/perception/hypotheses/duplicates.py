@@ -12,7 +12,7 @@ from stages.messages.scene import ObjectPose
 SHARED = 0.6
 """Share of the smaller of two boxes that lies in the other if both frame one object, or a part of it."""
 _APART = 0.01
-"""Metres between the origins of two poses of one object; two of its kind can hardly stand nearer to each other."""
+"""Metres between the origins of two poses of one object; only thin ones that lie in each other are nearer."""
 
 
 def unrepeated(labels: Sequence[str], boxes: Sequence[Floats], places: Sequence[Floats] | None = None) -> list[int]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import along, pose
-from stages.geometry.regions import EMPTY, Region, hull
+from stages.geometry.regions import Region, hull
 from stages.perception.rendering.rasteriser import Float32s, View
 
 _SAMPLES = 6000
@@ -27,10 +27,12 @@ _BELOW = 0.5
 _CLEARANCE = 0.003
 """Metres above the plane's noise up to which a reading may be the plane's own."""
 _CELL = 0.01
+_WIDE = 3.0
+"""A cell of the support surface is 1 cm wide, or so many pixels where these are wider, ..."""
 _PER_CELL = 3
-"""Readings that show a cell of the support surface."""
-_BRIDGED = 11
-"""Cells across which parts of one surface may lie apart, because of what stands between."""
+"""... and is seen by so many readings."""
+_BRIDGED = 0.11
+"""Metres across which parts of one surface may lie apart, because of what stands between."""
 _TALLEST = 0.3
 """Metres above the plane below which the middle of an object lies."""
 
@@ -63,30 +65,33 @@ def height_above(depth: NDArray[np.floating], view: View, T_camera_table: Floats
     return (slope * depth - (normal * origin).sum()).astype(np.float32)
 
 
-def support_region(depth: Float32s, view: View, T_camera_table: Floats) -> Region:
+def support_region(depth: Float32s, view: View, T_camera_table: Floats) -> Region | None:
     """Where the support surface is seen: the corners of its convex hull in the table's frame, K x 2 metres.
 
-    Readings on the plane are counted on a grid of 1 cm, so that single stray ones do not widen it. Of several parts far
-    from each other, which are other surfaces at the same height, the one with most cells counts.
+    Readings on the plane are counted on a grid of 1 cm, wider where pixels are few, so that single stray ones do not
+    widen it. Of several parts far from each other, which are other surfaces at the same height, the one with most cells
+    counts. None where no part is seen.
     """
     on_it = (depth > 0) & (np.abs(height_above(depth, view, T_camera_table)) < noise(depth))
     points = (view.rays()[on_it] * depth[on_it][:, None] - T_camera_table[:3, 3]) @ T_camera_table[:3, :2]
-    cells = np.floor(points / _CELL).astype(np.int64)
-    if not len(cells):
-        return EMPTY
+    if not len(points):
+        return None
+    cell = max(_CELL, _WIDE * float(np.median(depth[on_it])) / view.fx)
+    cells = np.floor(points / cell).astype(np.int64)
     low = cells.min(0)
     counts = np.zeros(cells.max(0) - low + 1, np.int64)
     np.add.at(counts, tuple((cells - low).T), 1)
-    rows, columns = np.nonzero(_largest_part(counts >= _PER_CELL))
-    return hull((np.stack([rows, columns], 1) + low + 0.5) * _CELL)
+    rows, columns = np.nonzero(_largest_part(counts >= _PER_CELL, bridged=max(1, round(_BRIDGED / cell))))
+    region = hull((np.stack([rows, columns], 1) + low + 0.5) * cell)
+    return region if len(region) else None
 
 
-def _largest_part(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells of the part that has most; what objects hide does not part a surface."""
-    disc = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRIDGED, _BRIDGED)), np.uint8)
-    padded = np.pad(cells, _BRIDGED).astype(np.uint8)
+def _largest_part(cells: NDArray[np.bool_], *, bridged: int) -> NDArray[np.bool_]:
+    """The cells of the part that has most; what objects hide, ``bridged`` cells, does not part a surface."""
+    disc = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (bridged, bridged)), np.uint8)
+    padded = np.pad(cells, bridged).astype(np.uint8)
     _, labels = cv2.connectedComponents(cv2.dilate(padded, disc), connectivity=8)
-    inner = labels[_BRIDGED:-_BRIDGED, _BRIDGED:-_BRIDGED]
+    inner = labels[bridged:-bridged, bridged:-bridged]
     sizes = np.bincount(inner[cells], minlength=1)
     return cells & (inner == sizes.argmax())
 

@@ -3,9 +3,12 @@
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
+from runner.cli import doctor
 from runner.cli.doctor import Finding, examine_graph
 from runner.contract import Finished, Refused, Stage
 
@@ -34,6 +37,14 @@ class Broken(Plain):
     def examine(cls) -> str:
         os.kill(os.getpid(), signal.SIGSEGV)
         return ""
+
+
+def test_what_a_container_keeps_of_files_is_memory_that_can_be_had(monkeypatch: pytest.MonkeyPatch):
+    says = {"memory.max": "8000000000", "memory.current": "7600000000", "memory.stat": "inactive_file 3000000000"}
+    monkeypatch.setattr(doctor, "_group_text", lambda name: says[name])
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**11))
+    found = doctor._memory()
+    assert (found.judgement, found.text) == ("good", "3.4 GB available, the control group allows 8 GB")
 
 
 def examined(folder: Path, stage: type[Stage]) -> list[Finding]:

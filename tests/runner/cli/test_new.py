@@ -1,6 +1,7 @@
 """A project that ``runner new`` writes works at once, and stands for how a project should look."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -19,7 +20,7 @@ BIN = Path(sys.executable).parent
 
 def do(folder: Path, *command: str | Path) -> str:
     """What a command prints that ends well."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": f"{BIN}:{os.environ['PATH']}"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -33,7 +34,7 @@ def runner(folder: Path, *arguments: str) -> str:
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("new")
     said = runner(folder, "new", "weather")
-    assert said.splitlines()[-1] == "now: cd weather && runner up graph.yaml && pytest"
+    assert said.splitlines()[-1] == "now: cd weather && runner up graph.yaml; its tests: pip install pytest && pytest"
     assert all((folder / line).is_file() for line in said.splitlines()[:-1])
     return folder / "weather"
 
@@ -45,13 +46,15 @@ def test_it_holds_what_a_project_needs_and_no_placeholder(project: Path):
     assert tomllib.loads(files["pyproject.toml"])["project"]["dependencies"] == [DISTRIBUTION]
 
 
-def test_it_checks_runs_replays_and_passes_its_tests(project: Path):
-    assert runner(project, "check", "graph.yaml") == "graph.yaml: 2 stages, 2 processes, 1 edges: good\n"
-    said = runner(project, "up", "graph.yaml")
-    assert "COMPLETE" in said and said.splitlines()[-1].startswith("the mean is ")
-    (recording,) = (project / "recordings").glob("weather-*.mcap")
-    assert "IDENTICAL: 21 messages" in runner(project, "replay", str(recording), "--verify")
-    assert "4 passed" in do(project, sys.executable, "-m", "pytest")
+def test_what_its_readme_says_works_in_that_order(project: Path):
+    commands = re.findall(r"^(runner .*|pytest) +#", (project / "README.md").read_text(), re.M)
+    check, up, info, replay, again, tests = (do(project, "sh", "-c", command) for command in commands)
+    assert check == "graph.yaml: 2 stages, 2 processes, 1 edges: good\n"
+    assert ": COMPLETE" in up and up.splitlines()[-1].startswith("the mean is ")
+    assert ": COMPLETE" in info and "41 messages" in info
+    assert "IDENTICAL: 21 messages" in replay
+    assert ": COMPLETE" in again
+    assert "4 passed" in tests
 
 
 def test_it_is_clean(project: Path):
@@ -67,10 +70,12 @@ def test_it_is_clean(project: Path):
     [
         (
             "Weather-Station",
-            "lower case letters, digits and _, the first a letter; valid, for example: weather_station",
+            "lower case letters, digits and _, the first a letter, the last no _; valid, for example: weather_station",
         ),
-        ("2fast", "lower case letters, digits and _, the first a letter; valid, for example: my_2fast"),
-        ("", "lower case letters, digits and _, the first a letter; valid, for example: robot"),
+        ("2fast", "lower case letters, digits and _, the first a letter, the last no _; valid, for example: my_2fast"),
+        ("", "lower case letters, digits and _, the first a letter, the last no _; valid, for example: robot"),
+        ("robot_", "the last no _; valid, for example: robot"),
+        ("x" * 300, f"the last no _; valid, for example: {'x' * 32}"),
         ("class", "'class' means something else in Python; valid, for example: my_class"),
         ("tests", "'tests' means something else in a project; valid, for example: my_tests"),
         (

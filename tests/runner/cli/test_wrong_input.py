@@ -58,6 +58,7 @@ def no_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["check", *GRAPH, "score=toys"], "--set score: 'toys' does not fit (module:Class)"),
         (["doctor", "--recordings", __file__], f"recordings     {__file__} is no folder that can be written"),
         (["up", str(TOYS), "--arm"], "toys.yaml: --arm: no stage has the setting 'armed'"),
+        (["logs", "--run", "toys", "--recordings", "."], "runner logs: --run NAME or --recordings DIR, not both"),
         (["page", "--port", "99999"], "argument --port: '99999': must be 0 to 65535"),
         (["call", "account", "add", "amount=1", "amount=2"], "amount=2: amount is given twice"),
     ],
@@ -72,7 +73,12 @@ def test_it_is_said_in_one_line(typed: list[str], said: str, capsys: pytest.Capt
 @pytest.mark.parametrize("stage", ["/home/somebody/toys.mcap", "**", "a[b"])
 def test_the_log_of_no_stage(toys: Path, stage: str, capsys: pytest.CaptureFixture[str]):
     assert status(["logs", stage, "--recordings", str(toys.parent)]) == 2
-    assert f"nothing from a stage {stage!r}; valid: none" in capsys.readouterr().err
+    assert f"no stage {stage!r}; valid: counter, gatherer, recorder, sink, " in capsys.readouterr().err
+
+
+def test_a_stage_that_has_said_nothing_has_an_empty_log(toys: Path, capsys: pytest.CaptureFixture[str]):
+    assert status(["logs", "counter", "--recordings", str(toys.parent)]) == 0
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_message_that_is_not_there_has_neighbours(toys: Path, capsys: pytest.CaptureFixture[str]):
@@ -84,9 +90,14 @@ def test_a_message_that_is_not_there_has_neighbours(toys: Path, capsys: pytest.C
 def test_a_viewer_is_not_opened_for_nothing(toys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert status(["view", "nothing.mcap", "--live"]) == 2
     assert "nothing.mcap: no such file" in capsys.readouterr().err
-    for option in ("--save", "--png"):
-        assert status(["view", str(toys), option, str(tmp_path)]) == 2
-        assert f"{tmp_path}: cannot be written" in capsys.readouterr().err
+    for option, suffix in (("--save", ".rrd"), ("--png", ".png")):
+        assert status(["view", str(toys), option, str(toys)]) == 2
+        assert capsys.readouterr().err == f"{option} {toys}: must end in {suffix}\n"
+    assert status(["view", "--live", "--png", "toys.png"]) == 2
+    assert "--png shows a graph that has ended" in capsys.readouterr().err
+    (tmp_path / "toys.rrd").touch()
+    assert status(["view", str(toys), "--save", str(tmp_path / "toys.rrd")]) == 2
+    assert "toys.rrd: cannot be written: File exists" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

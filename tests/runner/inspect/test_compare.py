@@ -53,6 +53,13 @@ def test_finds_a_changed_element_of_an_empty_shape_and_of_integers():
     assert "255" in found.extent
 
 
+def test_large_integers_differ_by_what_they_differ():
+    stamp, lowest = 1_790_000_000_000_000_000, -(2**63)
+    assert next(differences(stamp, stamp + 1)).largest == 1
+    assert next(differences(np.array([stamp, lowest]), np.array([stamp + 1, lowest]))).largest == 1
+    assert next(differences(np.array([lowest]), np.array([2**63 - 1]))).largest == 2.0**64
+
+
 def test_the_same_values_in_other_bytes_are_a_difference():
     one, other = (
         Envelope("a.b#0", "a.b#0", 0, "B", 1, (), msgspec.Raw(msgspec.msgpack.encode({"tags": tags})))

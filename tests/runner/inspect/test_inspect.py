@@ -13,12 +13,12 @@ from runner.cli.main import main
 from runner.contract import Refused
 from runner.graph.reading import load_graph
 from runner.inspect.causes import Causes
-from runner.inspect.info import Durations, StageTimes
+from runner.inspect.info import Durations, StageTimes, seconds
 from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
 from runner.message.codec import Envelope, Step
-from runner.recording.recording import Recording
-from tests.runner.common.recordings import TOYS, record_toys
+from runner.recording.recording import STEPS_ONLY, Recording
+from tests.runner.common.recordings import TOYS, record_toys, rewrite
 from tests.runner.common.runs import ALBUM
 
 MS = 1_000_000
@@ -55,6 +55,7 @@ def test_the_tree_leads_back_to_the_start_of_the_lineage_with_every_hop(toys: Pa
 
 
 def test_the_newest_recording_is_the_default(toys: Path, capsys: pytest.CaptureFixture[str]):
+    (toys.parent / "dead.mcap").symlink_to("absent.mcap")
     assert main(["why", "counter.number#0", "--recordings", str(toys.parent)]) == 0
     assert "counter.number#0  Number" in capsys.readouterr().out
 
@@ -90,6 +91,7 @@ def test_the_critical_path_goes_through_what_came_last(toys: Path):
     assert [hop.stage for hop in last.hops] == ["splitter", "worker", "gatherer", "sink"]
     times = [(hop.travelled_ns, hop.waited_ns, hop.computed_ns) for hop in last.hops]
     assert times == [tuple(MS * cost for cost in costs) for costs in COSTS.values()]
+    assert last.elapsed_ns >= sum(map(sum, times))
 
 
 def test_latency_by_edge_stage_and_lineage(toys: Path):
@@ -140,6 +142,25 @@ def test_a_message_that_one_recording_lacks(toys: Path, tmp_path: Path, capsys: 
     assert any(line.split() == ["gatherer/total", "1", "0"] for line in said.splitlines())
 
 
+# ------------------------------------------------------------------------------------ steps only
+
+
+def test_where_no_messages_were_recorded_none_are_compared_or_missed_and_steps_tell_the_time(
+    toys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    steps, _ = record_toys(tmp_path, keep=lambda record: record if isinstance(record, Step) else None)
+    path = rewrite(steps, tmp_path / "steps.mcap", lambda _, data: data, {"records": STEPS_ONLY})
+    for typed in (
+        ["diff", str(toys), str(path)],
+        ["diff", str(path), str(path)],
+        ["why", "sink.finished#0", str(path)],
+    ):
+        assert main(typed) == 2
+        assert capsys.readouterr() == ("", f"{path}: holds no messages (runner up --steps-only)\n")
+    assert main(["info", str(path)]) == 0
+    assert "lasted 0.00 ms" not in capsys.readouterr().out
+
+
 # ------------------------------------------------------------------------------------ step by step
 
 
@@ -150,6 +171,11 @@ def test_durations_in_little_memory_are_as_good_as_exact(times: list[int]):
         durations.note(one)
     assert (durations.total, durations.largest) == (sum(times), max(times))
     assert durations.median == pytest.approx(np.median(times), rel=0.01)
+
+
+def test_a_duration_is_rounded_before_it_is_put_into_words():
+    words = [seconds(1e9 * one) for one in (119.7, 60.2, 59.999, 59.99, 0.999999, 0.25)]
+    assert words == ["2 min 0 s", "1 min 0 s", "1 min 0 s", "59.99 s", "1.00 s", "250.00 ms"]
 
 
 def test_the_table_of_times_counts_steps_and_not_how_processes_end():

@@ -21,12 +21,13 @@ import pytest
 
 from runner.cli.completion import Shell, script
 from runner.cli.doctor import examine, examine_graph
+from runner.cli.main import main
 from runner.contract import Refused
 from runner.graph.graph import QUEUE
 from runner.graph.reading import load_graph
 from runner.inspect.echo import lines_of
-from runner.live.live import Live
-from runner.live.tables import show_progress
+from runner.live.live import Header, Live
+from runner.live.tables import rate_text, show_lines, show_progress
 from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.recording.recording import Recording
 from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
@@ -34,6 +35,7 @@ from runner.supervise.registry import Entry, Registration, find_run, runs
 from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
 from runner.transport.session import new_endpoint, runtime_folder
+from tests.runner.common.recordings import record_toys
 from tests.runner.common.runs import ACCOUNT, DOUBLES, TOYS, changed, finish, processes_of
 from tests.runner.common.runs import Run as Finished
 from tests.runner.common.toys import Sum
@@ -429,6 +431,35 @@ def test_a_topic_is_measured_by_headers_and_shown_without_its_type(account: Run)
     assert "no topic 'counter/numbr'; did you mean 'counter/number'" in refused.stderr
 
 
+def test_log_lines_are_of_the_folder_and_the_stage_that_are_named(account: Run, tmp_path: Path) -> None:
+    assert f"{tmp_path}: no recordings" in runner("logs", "--recordings", str(tmp_path)).stderr
+    refused = runner("logs", "acount", "--follow")
+    assert refused.stderr.startswith(f"{account.entry.recording}: no stage 'acount'; did you mean 'account'? valid: ")
+
+
+@pytest.mark.usefixtures("nothing_runs")
+@pytest.mark.parametrize("command", ["logs", "goals"])
+def test_the_recording_of_a_run_that_has_just_begun_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    made, recording = record_toys(tmp_path)[0], tmp_path / "late.mcap"
+    happens = iter((recording.touch, lambda: made.rename(recording)))
+    monkeypatch.setattr("runner.live.live.is_alive", lambda _: next(happens)() is not False)
+    listed = Registration(msgspec.structs.replace(entry("late"), recording=str(recording)))
+    try:
+        assert main([command]) == 0
+    finally:
+        listed.close()
+
+
+def test_log_lines_end_with_who_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stream, monkeypatch.context() as patch, pytest.raises(BrokenPipeError):
+        patch.setattr(sys, "stdout", stream)
+        show_lines(Path("toys.mcap"), [LogLine("sink", 0, "info", "done", 1)])
+
+
 def test_a_tool_that_stands_still_costs_the_graph_nothing(account: Run) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it, as would the tool
     tool = subprocess.Popen(
@@ -468,6 +499,11 @@ def test_two_graphs_never_meet(account: Run, tmp_path: Path) -> None:
         assert [found.run for found in runs()] == [account.entry.run]
     finally:
         other.close()
+
+
+def test_no_interval_is_negative_where_what_replicas_sent_arrives_in_another_order() -> None:
+    headers = [Header(sent_ns, 0, 1) for sent_ns in (30_000_000, 10_000_000, 20_000_000)]
+    assert "shortest 10.00 ms, longest 10.00 ms" in rate_text(headers)
 
 
 # ------------------------------------------------------------------------------------------ echo
@@ -580,7 +616,7 @@ def test_log_lines_of_a_run_and_its_end_in_order(account: Run) -> None:
     assert "2 added" in last
     assert "nothing to add" in last
     refused = runner("logs", "acount", "--recordings", str(account.folder))
-    assert "nothing from a stage 'acount'; did you mean 'account'" in refused.stderr
+    assert "no stage 'acount'; did you mean 'account'" in refused.stderr
     finished = account.finish()
     assert finished.code == 0, finished.output
     recording = Recording(finished.recording)

@@ -79,7 +79,7 @@ def test_parts_are_shared_and_each_replica_holds_few():
         delivery.appeared(Process("worker", replica))
     ids = [publish(delivery, wire, number, lineage=0) for number in range(6)]
     assert [replica for replica, _ in wire.take(4)] == [0, 1] * PREFETCH
-    delivery.answered("worker", [("input", ids[1])])
+    delivery.answered("worker", 0, [("input", ids[1])])
     assert wire.take(1) == [(1, ids[4])]
 
 
@@ -125,10 +125,22 @@ def test_a_full_queue_blocks_until_an_acknowledgement():
     late.start()
     late.join(0.2)
     assert late.is_alive()
-    delivery.answered("worker", [("input", ids[0])])
+    delivery.answered("worker", 0, [("input", ids[0])])
     late.join(5.0)
     assert not late.is_alive()
     assert len(wire.sent) == 3
+
+
+@pytest.mark.parametrize(("kept", "after_one", "after_both"), [(0, 1, 0), (8, 0, 0)])
+def test_what_every_replica_hears_is_awaited_from_each_unless_it_is_kept(kept: int, after_one: int, after_both: int):
+    """What is kept is put aside late by one that gets none of its parts."""
+    delivery, wire = make(replicas=2, kept=kept)
+    id = publish(delivery, wire, 0)
+    delivery.answered("worker", 1, [("input", id)])
+    delivery.lost(Process("worker", 0))
+    assert unanswered(delivery) == [after_one]
+    delivery.answered("worker", 0, [("input", id)])
+    assert unanswered(delivery) == [after_both]
 
 
 def test_a_queue_is_counted_in_lineages_so_that_a_gather_cannot_starve():
@@ -163,9 +175,9 @@ def test_a_consumer_that_stands_still_holds_up_no_acknowledgement_of_others():
 
     def hear() -> None:
         delivery.appeared(Process("worker", 0))
-        delivery.answered("printer", [("input", ids[0])])
+        delivery.answered("printer", 0, [("input", ids[0])])
         delivery.lost(Process("worker", 1))
-        delivery.answered("printer", [("input", ids[1])])
+        delivery.answered("printer", 0, [("input", ids[1])])
 
     with wire.standing_still:
         caller = threading.Thread(target=hear)

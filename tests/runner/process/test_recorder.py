@@ -35,9 +35,9 @@ class Picture(Message, frozen=True, kw_only=True):
 class Session:
     """A recorder process and a bus that speaks to it."""
 
-    def __init__(self, folder: Path, *program: str) -> None:
+    def __init__(self, folder: Path, *program: str, log: Path | None = None) -> None:
         self.path = folder / "pictures.mcap"
-        self.log = folder / "log.txt"
+        self.log = log or folder / "log.txt"
         endpoint = new_endpoint()
         self.bus = Bus("test", endpoint, process=Process("camera", 0), listen=True)
         self._recorded: list[tuple[str, str]] = []
@@ -185,3 +185,15 @@ def test_a_recorder_that_fails_ends_and_the_recording_says_why(tmp_path: Path, w
     assert last_lines(session.log, 1)[0].startswith(f"{session.path}: INCOMPLETE: {reason}; ")
     assert "Traceback" in session.log.read_text()
     assert reason in str(Recording(session.path).verdict)
+
+
+def test_a_recorder_ends_as_it_must_also_where_the_disk_under_its_log_is_full(tmp_path: Path, pictures: list[Picture]):
+    session = Session(tmp_path, "tests.runner.process.fails", "taker", log=Path("/dev/full"))
+    session.wait()
+    session.journal(session.send(0, pictures[0]))
+    assert session.process.wait(20) == EXIT_INCOMPLETE
+    session.bus.close()
+    assert "the recorder failed: MemoryError" in str(Recording(session.path).verdict)
+    refused = Session(tmp_path, log=Path("/dev/full"))
+    assert refused.process.wait(20) == EXIT_REFUSED
+    refused.bus.close()

@@ -24,7 +24,7 @@ class Recorder:
         route = msgspec.structs.replace(ROUTE, replicas=replicas, **changes)
         self.redelivery = Redelivery({TOPIC: (route,)}, lambda key, payload, _: self.sent.append((key, payload)))
 
-    def message(self, number: int) -> tuple[str, list[tuple[str, str]]]:
+    def message(self, number: int) -> tuple[str, list[tuple[str, int, str]]]:
         id = f"counter.number#{number}"
         sealed = Envelope(id, id, 0, "Number", 1, (), msgspec.Raw(b""))
         return id, list(self.redelivery.note_message(TOPIC, sealed, id.encode()))
@@ -96,7 +96,7 @@ def test_what_a_step_that_is_not_over_has_emitted_is_known_however_long_ago_that
     for number in range(1, REMEMBERED + 2):
         id, _ = recorder.message(number)
         recorder.step(id)
-    assert recorder.message(0) == (first, [("worker", "input")])
+    assert recorder.message(0) == (first, [("worker", 0, "input")])
 
 
 def test_a_new_publisher_is_told_which_parts_are_still_to_be_done():
@@ -148,7 +148,7 @@ def test_a_message_that_was_consumed_before_it_came_is_answered_when_it_comes():
     """Its publisher was killed before the recorder had it, and its successor sends it once more."""
     recorder = Recorder()
     recorder.step("counter.number#0")
-    assert recorder.message(0) == ("counter.number#0", [("worker", "input")])
+    assert recorder.message(0) == ("counter.number#0", [("worker", 0, "input")])
     recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == []
 
@@ -167,7 +167,7 @@ def test_a_message_that_comes_again_after_it_was_consumed_is_answered():
     assert answered == []
     assert recorder.message(0)[1] == []
     recorder.step(id)
-    assert recorder.message(0)[1] == [("worker", "input")]
+    assert recorder.message(0)[1] == [("worker", 0, "input")]
     recorder.redelivery.catch_up(Process("worker", 0, 1))
     assert recorder.take() == []
 

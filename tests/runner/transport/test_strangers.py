@@ -1,6 +1,7 @@
 """Who may listen to a run, and speak: everybody hears everything where the graph says so, and forges nothing."""
 
 import contextlib
+import json
 import os
 import pwd
 import re
@@ -14,13 +15,14 @@ from pathlib import Path
 
 import pytest
 
+from runner.cli.main import main
 from runner.hosts.head import control
 from runner.message.codec import pack
 from runner.recording.recording import Recording
 from runner.testing import read_until
 from runner.transport.session import private
 from tests.runner.common.machines import Party, on_loopback
-from tests.runner.common.runs import ALBUM, TOYS, changed, finish, meeting_of, start
+from tests.runner.common.runs import ACCOUNT, ALBUM, TOYS, changed, finish, meeting_of, start
 from tests.runner.common.waiting import wait_until
 from tests.runner.transport.test_bad_input import public_address, run_of, stranger
 
@@ -87,6 +89,12 @@ def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_
         wait_until(lambda: taken.stat().st_size == 60)
     assert (ended.code, len(ended.result)) == (0, 60), ended.output
     assert Recording(ended.recording).verdict.complete
+
+
+def test_what_the_supervisor_says_is_described_too(capsys: pytest.CaptureFixture[str]):
+    assert main(["schema", str(ACCOUNT)]) == 0
+    described = json.loads(capsys.readouterr().out)
+    assert {"counter/number", "supervisor/account_add", "supervisor/restarted"} <= set(described)
 
 
 def test_the_example_shows_what_flows(tmp_path: Path):

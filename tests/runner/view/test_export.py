@@ -118,6 +118,31 @@ def test_a_turned_place_frames_what_is_drawn_before_it_and_all_below_is_cleared(
     assert [len(message.points) for message in boxes] == [1, 0]
 
 
+class Odd(ToyViews):
+    """Draws what it may not, and one kind of drawing where another has stood."""
+
+    def draw(self, message: Message) -> Iterator[d.Drawing]:
+        if isinstance(message, Number):
+            yield d.Image("grey", np.zeros((4, 4), np.uint8))
+            yield d.Scalar("odd", np.float32(0.5))  # pyright: ignore
+            yield d.Scalar("odd", float("nan"))
+            yield d.Text("odd", "words")
+
+
+def test_what_cannot_be_written_is_left_out_and_two_kinds_on_a_path_do_not_mix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path, _ = record_toys(tmp_path, f"view={__name__}:Odd")
+    assert main(["export", str(path), "--foxglove", str(tmp_path / "out.mcap")]) == 0
+    assert capsys.readouterr().err.startswith("grey cannot be drawn: IndexError")
+    assert read(tmp_path / "out.mcap", "/odd.Log")[0].message == "words"
+    with (tmp_path / "out.mcap").open("rb") as file:
+        curve = [message.data for _, _, message in make_reader(file).iter_messages(topics=["/odd"])]
+    assert curve[:2] == [b'{"name": "odd", "value": 0.5}', b'{"name": "odd", "value": null}']
+    assert main(["view", str(path), "--save", str(tmp_path / "out.rrd")]) == 0
+    assert capsys.readouterr().err.startswith("grey cannot be drawn: IndexError")
+
+
 def test_rerun_opens_it(exported: Path, tmp_path: Path):
     command = [RERUN, "mcap", "convert", str(exported), "-o", str(tmp_path / "toys.rrd")]
     subprocess.run(command, check=True, capture_output=True, timeout=60)

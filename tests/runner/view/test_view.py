@@ -48,8 +48,8 @@ def test_every_kind_of_drawing_lands_in_the_file(toys: Path, tmp_path: Path, cap
 def test_a_recording_is_shown_until_a_message(toys: Path, tmp_path: Path):
     shown = {}
     for at in ("counter.number#0", "sink.finished#0"):
-        view_recording(toys, at=at, save=tmp_path / "toys.rrd")
-        shown[at] = entities(tmp_path / "toys.rrd")
+        view_recording(toys, at=at, save=tmp_path / f"{len(shown)}.rrd")
+        shown[at] = entities(tmp_path / f"{len(shown)}.rrd")
     first, last = shown.values()
     assert "/camera" in first and "/samples" not in first and "/samples" in last
     with pytest.raises(Refused, match=r"no message 'sink\.finished#1'; the nearest: sink\.finished#0"):
@@ -99,6 +99,7 @@ def test_follows_a_running_graph_and_never_holds_it_up(tmp_path: Path):
     stream.disconnect()
     assert not viewer.is_alive()
     assert "/camera/boxes" in entities(tmp_path / "live.rrd")
+    (tmp_path / "unreadable.mcap").mkdir()
     with pytest.raises(Refused, match="no graph is running"):
         newest_live(tmp_path)
 
@@ -166,5 +167,7 @@ def test_a_picture_shows_the_last_state(toys: Path, tmp_path: Path):
 
 def test_a_picture_of_nothing_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("shutil.which", lambda _: None)
+    (tmp_path / "old.png").touch()
     with pytest.raises(Refused, match="apt-get install xvfb"):
-        screenshot(tmp_path / "none.rrd", tmp_path / "none.png")
+        screenshot(tmp_path / "none.rrd", tmp_path / "old.png")
+    assert (tmp_path / "old.png").exists()

@@ -88,6 +88,7 @@ DAMAGES = [
     (edit_camera(lambda c: c["5"].pop("cam_K")), r"scene_camera\.json: image 5: .*`cam_K`"),
     (edit_camera(lambda c: c["5"].pop("depth_scale")), r"scene_camera\.json: image 5: .*`depth_scale`"),
     (edit_camera(lambda c: c["5"].update(cam_K=[1.0])), r"scene_camera\.json: image 5: .*length >= 9.*cam_K"),
+    (edit_camera(lambda c: c["5"].update(cam_K=[9, 1, 8, 0, 9, 6, 0, 0, 1])), r"image 5: cam_K: K = .*without skew"),
     (edit_camera(lambda c: c["5"].update(depth_scale=0)), r"scene_camera\.json: image 5: .*> 0.*depth_scale"),
     (write("test/000002/depth/000005.png", "png?"), r"depth/000005\.png: not a readable image"),
     (write("test_targets_bop19.json", "[]"), r"test_targets_bop19\.json: lists no images"),

@@ -42,6 +42,8 @@ def test_boxes_keep_the_order_of_the_file(tmp_path: Path) -> None:
         ([{key: GOOD[key] for key in GOOD if key != "score"}], "missing required field `score`"),
         ([GOOD | {"bbox": [1, 2, 3]}], r"bbox"),
         ([GOOD | {"bbox": [1, 2, 0, 4]}], r"bbox"),
+        ([GOOD, GOOD | {"score": 1.5}], "entry 1: score 1.5 must lie from 0 to 1"),
+        ([GOOD | {"score": -0.1}], "entry 0: score -0.1 must lie from 0 to 1"),
         ({"detections": []}, "Expected `array`"),
     ],
 )

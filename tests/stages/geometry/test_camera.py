@@ -2,10 +2,20 @@
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.geometry.camera import back_project, cropped, intrinsics, project, ray_factors, rays, scaled
+from stages.geometry.camera import (
+    back_project,
+    checked_intrinsics,
+    cropped,
+    intrinsics,
+    project,
+    ray_factors,
+    rays,
+    scaled,
+)
 
 K = np.array([[525.0, 0, 319.5], [0, 530.0, 231.2], [0, 0, 1]])
 numbers = st.floats(-0.5, 0.5)
@@ -50,3 +60,14 @@ def test_cropped_camera_sees_the_point_relative_to_the_corner(x: float, y: float
 
 def test_ideal_camera_looks_through_the_middle() -> None:
     assert tuple(intrinsics(500.0, 640, 480)[:2, 2]) == (319.5, 239.5)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(0, 1, 2.0), (1, 0, 0.1), (2, 2, 2.0), (1, 1, 0.0), (0, 2, np.nan)]
+)
+def test_a_matrix_that_is_no_pinhole_cameras_is_refused(row: int, column: int, value: float) -> None:
+    assert checked_intrinsics(K) is K
+    wrong = K.copy()
+    wrong[row, column] = value
+    with pytest.raises(ValueError, match=rf"K = .*{value}.*: must be fx 0 cx, 0 fy cy, 0 0 1 .* without skew"):
+        checked_intrinsics(wrong)

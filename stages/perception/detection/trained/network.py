@@ -177,7 +177,7 @@ def detect(
     logits, offsets = network.proposals(coarse)
     proposals = network.propose(logits[0], offsets[0], keep=64)
     label_logits, refinements = network.classify(fine, proposals[None])
-    boxes = _numpy(clip(apply_offsets(proposals, refinements)))
+    boxes = _numpy(clip(apply_offsets(proposals, refinements), width=rgb.shape[1] * scale, height=rgb.shape[0] * scale))
     confidences = _numpy(functional.softmax(label_logits.double(), dim=1))[:, :-1]
     confidences = confidences if labels is None else confidences[:, labels]
     best = confidences.max(axis=1)
@@ -231,9 +231,9 @@ def roi_align(features: Tensor, boxes: Tensor, *, cells: int, stride: int) -> Te
     return functional.avg_pool2d(samples, 2)
 
 
-def clip(boxes: Tensor) -> Tensor:
-    """Boxes cut at the image's edge, at least one pixel wide and high; N x 4."""
-    limits = torch.tensor([WIDTH, HEIGHT], dtype=boxes.dtype)
+def clip(boxes: Tensor, *, width: float = WIDTH, height: float = HEIGHT) -> Tensor:
+    """Boxes cut at the edge of an image so wide and high, at least one pixel wide and high; N x 4."""
+    limits = torch.tensor([width, height], dtype=boxes.dtype)
     low = torch.minimum(boxes[:, :2].clamp(min=0.0), limits - 1)
     return torch.cat([low, torch.maximum(torch.minimum(boxes[:, 2:], limits), low + 1)], dim=1)
 

@@ -85,7 +85,7 @@ def test_an_image_that_is_too_short_is_refused() -> None:
 
 
 def test_what_a_camera_info_says() -> None:
-    projection = np.column_stack([2 * K, np.zeros(3)]).ravel()
+    projection = np.column_stack([np.diag([2.0, 2.0, 1.0]) @ K, np.zeros(3)]).ravel()
     assert pinhole(info(K, (80, 100), d=[0.1] * 5, p=projection), rectified=True)[0, 0] == 200
     assert pinhole(info(K, (80, 100), d=[0.0] * 5), rectified=False).tolist() == K.tolist()
     rgb, metres = np.zeros((80, 100, 3), np.uint8), np.ones((80, 100), np.float32)
@@ -97,6 +97,8 @@ def test_what_a_camera_info_says() -> None:
         lens(info(K, (80, 100), d=[0.1], distortion_model="thin"), K, rectified=False)
     with pytest.raises(ValueError, match="the camera is not calibrated"):
         pinhole(TYPES.new("sensor_msgs/msg/CameraInfo"), rectified=False)
+    with pytest.raises(ValueError, match=r"K = .*without skew"):
+        pinhole(info(K + np.diag([2.0, 0], 1), (80, 100), d=[]), rectified=False)
 
 
 def rvl(values: np.ndarray) -> bytes:

@@ -38,3 +38,10 @@ def test_one_tall_object_does_not_make_all_that_it_touches_as_high() -> None:
         for x in np.array([-0.12, 0.09]) + ROBOT.table.center[0]
     )
     assert low < 0.15 and high > 0.2
+
+
+def test_a_table_that_shows_in_single_readings_only_is_not_seen() -> None:
+    T_base_table = pose(np.eye(3), np.array([*ROBOT.table.center, ROBOT.table.height]))
+    depth = np.zeros((VIEW.height, VIEW.width), np.float32)
+    depth[::8, ::8] = render({}).scene.depth[::8, ::8]
+    assert occupied(depth, VIEW, T_base_table @ inverse(camera()), ROBOT, np.random.default_rng(0)) is None

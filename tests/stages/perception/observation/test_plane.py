@@ -170,7 +170,9 @@ def seen_surface(edge: float, *, stray: int = 0, elsewhere: bool = False) -> np.
     rows, columns = np.nonzero(gone)
     chosen = rng.choice(len(rows), stray, replace=False)
     depth[rows[chosen], columns[chosen]] = seen.depth[rows[chosen], columns[chosen]]
-    return support_region(depth.astype(np.float32), VIEW, T)
+    region = support_region(depth.astype(np.float32), VIEW, T)
+    assert region is not None
+    return region
 
 
 @pytest.mark.parametrize(("stray", "elsewhere"), [(0, False), (10, False), (0, True)])
@@ -182,4 +184,16 @@ def test_the_surface_ends_where_the_table_does(stray: int, elsewhere: bool) -> N
 
 
 def test_no_surface_is_seen_where_there_is_no_reading() -> None:
-    assert len(support_region(np.zeros((VIEW.height, VIEW.width), np.float32), VIEW, camera())) == 0
+    assert support_region(np.zeros((VIEW.height, VIEW.width), np.float32), VIEW, camera()) is None
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_few_pixels_show_as_much_of_a_table(stride: int) -> None:
+    """A table of 0.8 m by 0.6 m in an image of down to 80 x 60 pixels."""
+    T, depth = camera(), render({}, noise=0.002).scene.depth
+    x, y = np.moveaxis((VIEW.rays() * depth[..., None] - T[:3, 3]) @ T[:3, :2], -1, 0)
+    on_it = np.where((abs(x) < 0.4) & (abs(y) < 0.3), depth, np.float32(0))
+    view = VIEW.sampled(0, 0, VIEW.width, VIEW.height, stride)
+    region = support_region(np.ascontiguousarray(on_it[::stride, ::stride]), view, T)
+    assert region is not None
+    assert regions.area(region) == pytest.approx(0.8 * 0.6, rel=0.15)

@@ -64,6 +64,14 @@ def test_images_of_any_shape_are_scaled_to_fit(size: tuple[int, int], scale: flo
     assert (image > 0).all(axis=-1).sum() == pytest.approx(size[0] * size[1] * scale**2, rel=0.01)
 
 
+@pytest.mark.parametrize("size", [(360, 640), (640, 360)])
+def test_boxes_end_where_an_image_of_any_shape_does(size: tuple[int, int]) -> None:
+    torch.manual_seed(3)
+    image = np.random.default_rng(0).integers(0, 255, (*size, 3)).astype(np.uint8)
+    boxes = detect(DetectionNetwork(("cup",)).eval(), image, threshold=0.0, keep=64).boxes
+    assert boxes.min() >= 0 and boxes[:, 2:].max(0) == pytest.approx(size[::-1])
+
+
 def test_weights_survive_the_file_and_detect_the_same(tmp_path: Path) -> None:
     torch.manual_seed(3)
     DetectionNetwork(("cup", "tray")).save(tmp_path / "w.safetensors")
