@@ -636,6 +636,16 @@ def test_a_place_beyond_the_tables_edge_beside_what_nobody_can_move_is_refused_a
     assert not any("plans one transfer after the other" in line for line in context.lines)
 
 
+def test_what_belongs_near_the_edge_is_turned_along_it_where_no_quarter_turn_fits():
+    goal = Layout().put("tray", 0, 0).put("tea_box", 0, -0.22, yaw=0.6)
+    start = Layout().put("tray", 0, 0).put("tea_box", -0.25, 0)
+    table = np.array([[-0.4, -0.275], [0.4, -0.275], [0.4, 0.2], [-0.4, 0.2]])
+    current = msgspec.structs.replace(start.graph(), support=table)
+    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=current), Recorded())
+    assert found.status == "solved"
+    assert reached(goal, executed(start, found))
+
+
 @pytest.mark.parametrize("unknown", ["goal", "current"])
 def test_a_scene_of_a_camera_that_does_not_know_where_it_is_is_no_place_to_move_in(unknown: str):
     scenes = {"goal": breakfast().graph(), "current": START.graph()}

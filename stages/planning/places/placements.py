@@ -24,6 +24,8 @@ RING = 24
 """Most places around a symmetric parent."""
 TURNED = 0.03
 """Cost of a quarter turn that the demonstration did not show, in metres of shift."""
+_ASKEW = 1.0
+"""Cost of half of one: where nothing else fits."""
 _HANGS = 0.012
 """Metres above what carries it from which on something must be under an object."""
 _LEANS = np.deg2rad(3)
@@ -145,7 +147,7 @@ class Placements:
         costs: list[Floats] = []
         for k, T in enumerate(nominal):
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
-            for facing, cost in self._orientations(T, item, scene):
+            for facing, cost in self._orientations(T, item, scene, askew=bool(step.region)):
                 bases.append(Standing.at(step.item, stances, facing))
                 costs.append(away + cost + lengths[: None if k == 0 and cost < TURNED else 13])
         which = [(base, shift) for base, some in enumerate(costs) for shift in range(len(some))]
@@ -156,10 +158,13 @@ class Placements:
             if self._as_taught(step, standing, scene):
                 yield Placement(standing, float(every[number]))
 
-    def _orientations(self, T: Floats, item: Standing, scene: Scene) -> list[tuple[Floats, float]]:
-        """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it."""
+    def _orientations(self, T: Floats, item: Standing, scene: Scene, *, askew: bool) -> list[tuple[Floats, float]]:
+        """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it; else
+        in the end ``askew`` ones, too."""
         if item.name not in self._sides:
-            return _any_side(T, item)
+            ways = _any_side(T, item)
+            between = yawed(np.pi / QUARTERS, np.zeros(3))[:3, :3]
+            return ways + [(_turned(way, between), _ASKEW + cost) for way, cost in ways if askew]
         faced = inverse(scene.T_base_table) @ turned_to(self._poses[item.name], self._sides[item.name])
         faced[:3, 3] = T[:3, 3]
         return [(faced, 0.0)]

@@ -68,7 +68,7 @@ def test_a_process_whose_end_another_thread_sees_is_signalled_in_vain():
             wait_until(lambda: super(Seen, self).poll() is not None)
             return found
 
-    process = Seen(os.posix_spawn("/bin/sleep", ["sleep", "0.1"], {}))
+    process = Seen(os.posix_spawn(sys.executable, [sys.executable, "-c", "import time; time.sleep(0.1)"], {}))
     process.send_signal(signal.SIGCONT)
     assert process.wait() == 0
     process.send_signal(signal.SIGCONT)
