@@ -93,8 +93,8 @@ def test_a_stranger_that_stands_still_costs_nothing_and_one_that_does_not_still_
 
 def test_what_the_supervisor_says_is_described_too(capsys: pytest.CaptureFixture[str]):
     assert main(["schema", str(ACCOUNT)]) == 0
-    described = json.loads(capsys.readouterr().out)
-    assert {"counter/number", "supervisor/account_add", "supervisor/restarted"} <= set(described)
+    topics = json.loads(capsys.readouterr().out)
+    assert {"counter/number", "supervisor/account_add", "supervisor/restarted"} <= set(topics)
 
 
 def test_the_example_shows_what_flows(tmp_path: Path):
