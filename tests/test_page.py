@@ -131,7 +131,7 @@ def restores_and_stops(page: Page) -> None:
     assert faults(page) == []
     page.get_by_role("button", name="Go", exact=True).press("Enter")
     for number, name in enumerate(("milk carton", "cup"), 1):
-        step = re.compile(rf"Puts the {name} on the table.*Step {number} of 2")
+        step = re.compile(rf"Now\s+Puts the {name} on the table\s.*Step {number} of 2", re.DOTALL)
         expect(page.get_by_role("region", name="Now")).to_contain_text(step)
     expect(page.get_by_role("button", name="Restore")).to_be_disabled()
     page.keyboard.press("Escape")
