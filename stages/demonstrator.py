@@ -67,6 +67,8 @@ _EXCHANGES = 200
 """Ways to name equal objects that are compared; where there are more, the one by single objects comes first."""
 _WRONG_SIDE = "is not seen to show the side that it should"
 _UNKNOWN = "something is there that no object explains"
+_SAME_PLACE = 0.05
+"""Metres between the middles of what no object explains in two looks up to which it is the same thing."""
 
 
 class Phase(Enum):
@@ -646,6 +648,9 @@ class Demonstrator(Stage):
         if covered := self._covered(goal):
             why = f"something unknown stands on {', '.join(covered)}, which the goal wants clear"
             return self._look_again("perception", why, ctx)
+        if not state.ask and self._misses_unknown(goal):
+            why = "what stood there and no object explained when the goal was taught is not seen there now"
+            return self._look_again("perception", why, ctx)
         if unsure := _doubtful_parents(goal):
             why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
             return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
@@ -666,6 +671,16 @@ class Demonstrator(Stage):
             for one in (scene, goal)
         )
         return sorted(now - then - {*self._state.remembered})
+
+    def _misses_unknown(self, goal: SceneGraph) -> bool:
+        """Whether something that no object explained when the goal was taught stands elsewhere now, or was part of one
+        of the objects: it may have been one that the goal should name."""
+        assert self._state.scene is not None
+        now, then = (
+            [(one.T_base_table @ (*region.centre_table, 1.0))[:3] for region in one.unknown]
+            for one in (self._state.scene, goal)
+        )
+        return any(all(np.linalg.norm(here - there) > _SAME_PLACE for here in now) for there in then)
 
     def _check_transfer(self, scene: SceneGraph, violated: Sequence[Assertion], ctx: Context) -> None:
         """Compares the scene with what the newest transfer promised; one that failed stays in the plan.

@@ -39,7 +39,7 @@ HEAR_OUT_SECONDS = 5.0
 LAST_RESORT_SECONDS = 30
 """After that the kernel ends a recorder that outlives its supervisor."""
 EXIT_INCOMPLETE = 1
-REST_SECONDS = 0.005
+REST_SECONDS = 0.01
 """What may come together before the recorder looks again."""
 UNSEEN_SECONDS = 0.5
 """How long it may take to see a process that has died at once."""

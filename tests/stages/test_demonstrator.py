@@ -184,6 +184,23 @@ def test_what_nobody_recognised_on_what_the_goal_wants_clear_is_no_success() -> 
     assert the_verdict(episode.seen(goal)).success
 
 
+def test_what_nobody_recognised_in_the_goal_must_be_there_again() -> None:
+    """Of a bowl under a mug a ring shows; a mug by itself is not that goal, though nobody can say what it lacks."""
+
+    def with_thing(x: float) -> SceneGraph:
+        centre, extent = np.array([x, 0.2, 0.02]), np.array([0.05, 0.05, 0.04])
+        return msgspec.structs.replace(
+            GOAL, unknown=(UnknownRegion(box=np.zeros(4), points=90, centre_table=centre, extent_table=extent),)
+        )
+
+    for seen, there in ((with_thing(0.04), True), (with_thing(0.2), False), (GOAL, False)):
+        episode = Episode(repeats=0)
+        episode.until_start(with_thing(0.0))
+        verdict = the_verdict(episode.seen(seen))
+        assert (verdict.success, verdict.failed_stage) == (there, "" if there else "perception")
+        assert ("no object explained when the goal was taught" in verdict.reason) is not there and not verdict.violated
+
+
 @pytest.mark.parametrize("turn", [1, 3])
 def test_a_goal_of_many_equal_objects_holds_whichever_is_which(turn: int) -> None:
     """Six shakers, one on each carrier, can be named in 720 ways."""

@@ -331,6 +331,19 @@ def test_what_nothing_explains_is_looked_for_though_no_box_shows_it(filter_stage
     assert np.linalg.norm((cup.T_camera_object - behind.poses["cup"])[:3, 3]) < 0.01
 
 
+@pytest.mark.parametrize("yaw", [0.4, 2.0, 3.6])
+def test_of_what_stands_below_another_object_both_sides_may_show(yaw: float, filter_stage: ParticleFilter) -> None:
+    """A bowl with a mug in it, of which the detector sees the mug alone: no side of the bowl tells what it is."""
+    bowl, mug = upright("bowl", 0.0, 0.0, 0.0), upright("mug", 0.0, 0.0, yaw)
+    mug[2, 3] += 0.012
+    seen = render({"bowl": bowl, "mug": mug})
+    found = candidates(("mug", seen.boxes["mug"], 0.95))
+    config = Hypotheses.Config(n_objects="auto", suggestions=True)
+    (observation, *hypotheses), _ = enumerate_(config, frame(seen), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert sorted(item.label for item in estimate.objects) == ["bowl", "mug"]
+
+
 def test_what_carries_something_is_found_by_the_gap_below_it(filter_stage: ParticleFilter) -> None:
     """A can under a box, of which so little shows that no detector sees it."""
     box = upright("tea_box", 0.0, 0.0, 0.4)

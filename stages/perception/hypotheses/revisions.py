@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -148,6 +149,17 @@ def combined(posteriors: Sequence[Posterior], earlier: Sequence[Contender], offe
 def new_offers(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Offer]:
     """Those of some suggestions that were not made before."""
     return [each for each in suggestions if not any(_same(each, offer) for offer in offers)]
+
+
+def some_of_each_box(revisions: Sequence[Revision], offers: Sequence[Offer], most: int) -> list[Revision]:
+    """The first few revisions of those that bring in one offer each, by its box: no box keeps others from a trial."""
+    tried = Counter[tuple[float, ...]]()
+    found: list[Revision] = []
+    for revision in revisions:
+        box = tuple(offers[revision.new[0]].candidate.box.tolist())
+        tried[box] += 1
+        found += [revision] if tried[box] <= most else []
+    return found
 
 
 def is_better(log_weight: float, known: float) -> bool:

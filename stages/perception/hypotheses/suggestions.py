@@ -4,6 +4,7 @@ hangs in the air."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -59,15 +60,21 @@ class Suggestions:
         return any(depth > tolerances.contact for depth in depths)
 
     def _unknown(self, scene: ObservedScene, layers: Sequence[Float32s]) -> Iterator[Offer]:
-        """Every object that is large enough in every region that no object explains, at first those as high as it."""
-        for region in unknown_regions(scene, layers):
+        """Every object that is large enough in every region that no object explains, at first those as high as it.
+
+        Of what another object stands on, or in front of, two ends may show: the two regions that are nearest to each
+        other come first, as one.
+        """
+        regions = unknown_regions(scene, layers)
+        together = sorted((one.joined(other) for one, other in combinations(regions, 2)), key=lambda each: each.size)
+        for region in (*together[:1], *regions):
             fitting = [label for label in self._catalogue.objects if self._may_show(label, region)]
             top = float(region.centre_table[2] + region.extent_table[2] / 2)
             fitting.sort(key=lambda label: min(abs(height - top) for height in self._heights(label)))
             yield from _offers(fitting, region.box)
 
     def _may_show(self, label: str, region: UnexplainedRegion) -> bool:
-        return bool(np.linalg.norm(region.extent_table) < np.linalg.norm(self._catalogue[label].dimensions) + _LEEWAY)
+        return bool(region.size < np.linalg.norm(self._catalogue[label].dimensions) + _LEEWAY)
 
     def _heights(self, label: str) -> list[float]:
         """How high an object is in each way that it rests, metres."""

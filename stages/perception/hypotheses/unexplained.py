@@ -50,6 +50,20 @@ class UnexplainedRegion:
     extent_table: Floats
     """Edges of that box, metres."""
 
+    @property
+    def size(self) -> float:
+        """Diagonal of the box that encloses the readings, metres."""
+        return float(np.linalg.norm(self.extent_table))
+
+    def joined(self, other: UnexplainedRegion) -> UnexplainedRegion:
+        """Both as one region."""
+        low, high = (
+            bound([each.centre_table + sign * each.extent_table / 2 for each in (self, other)], axis=0)
+            for bound, sign in ((np.min, -1), (np.max, 1))
+        )
+        box = np.array([*np.minimum(self.box, other.box)[:2], *np.maximum(self.box, other.box)[2:]])
+        return UnexplainedRegion(box, self.points + other.points, (low + high) / 2, high - low)
+
 
 def unknown_regions(scene: ObservedScene, layers: Sequence[Float32s]) -> tuple[UnexplainedRegion, ...]:
     """Clusters what stands on the plane and belongs to no object, the largest first.

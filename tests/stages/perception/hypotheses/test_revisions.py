@@ -10,7 +10,7 @@ import numpy as np
 from stages.geometry.arrays import Floats
 from stages.messages import Candidate, ObjectPose, Posterior
 from stages.messages.digest import Contender, Offer
-from stages.perception.hypotheses.revisions import Revision, combined, equalled, suggested
+from stages.perception.hypotheses.revisions import Revision, combined, equalled, some_of_each_box, suggested
 
 LEFT, RIGHT = np.array([0.0, 0, 40, 60]), np.array([100.0, 0, 140, 60])
 
@@ -96,3 +96,9 @@ def test_what_hangs_is_carried_by_something_though_a_box_below_it_leaves_somethi
     offers += offered(("tuna_can", gap, True), ("sponge", gap, True))
     best = msgspec.structs.replace(posterior(0, -90.0, 0, offers=offers), unexplained=(0.0, 0.2, 0.2))
     assert suggested(best, offers) == [Revision((0,), (4,))]
+
+
+def test_no_box_keeps_others_from_a_trial():
+    offers = offered(*((label, box, True) for box in (LEFT, RIGHT) for label in ("cup", "mug", "sponge")))
+    revisions = [Revision((), (k,)) for k in range(6)]
+    assert [one.new for one in some_of_each_box(revisions, offers, 2)] == [(0,), (1,), (3,), (4,)]
