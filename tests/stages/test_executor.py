@@ -14,7 +14,7 @@ from stages.devices.simulation import Simulation
 from stages.devices.suites import tray
 from stages.executor import Executor
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import exp_so3
+from stages.geometry.poses import exp_so3, pose
 from stages.messages import (
     Arrangement,
     Arrived,
@@ -591,6 +591,22 @@ def test_what_somebody_puts_in_the_way_home_is_felt_and_another_way_is_found() -
     after = bench.poses()
     assert np.linalg.norm(after["cup"][:2, 3] - [0.62, -0.30]) < 0.02
     assert after["milk_carton"][2, 2] > 0.99
+
+
+def test_a_hand_that_somebody_has_put_something_against_gets_away_from_it() -> None:
+    """The arm could not go home before: it stands against a carton, and cannot go straight up."""
+    bench = Bench(0, "tea")
+    T = pose(exp_so3(np.array([0.23, -0.011, -1.784])), np.array([0.5397, -0.3127, 0.7845]))
+    q = np.array([0.3847, -0.8036, -0.588, 0.307, 1.6126, 0.8445, 0.102, 0.4494])
+    transfer = Transfer(object="carton", source="table", destination="table", T_base_targets=T[None], pick="", place="")
+    carton = SceneObject(name="carton", label="cereal_box", T_base_object=T)
+    scene = replace(graph({}, ROBOT.table.height), objects=(carton,))
+    asked = bench.executor.on_transfer_request(TransferRequest(transfer=transfer, scene=scene, number=1), bench.ctx)
+    assert isinstance(asked, RobotCommand)
+    stands = RobotState(joint_names=ROBOT.joints, positions=q, gripper_width=0.1, time=0.0, stopped="", reason="")
+    answer = bench.executor.on_robot_state(stands, bench.ctx)
+    assert isinstance(answer, RobotCommand) and answer.label == "go home"
+    assert answer.guard is not None and np.allclose(answer.positions[-1], ROBOT.home, atol=1e-6)
 
 
 def test_states_between_transfers_are_ignored() -> None:

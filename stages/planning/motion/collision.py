@@ -93,6 +93,12 @@ class CollisionWorld:
         mujoco.mj_collision(self._model, self._data)
         return self._data.ncon == 0
 
+    def depth(self, q: Floats) -> float:
+        """Metres by which joint positions ``q`` (J) fall short of the clearance where they do most, else 0."""
+        self.is_free(q)
+        contacts = self._data.contact[: self._data.ncon]
+        return max((float(contact.includemargin - contact.dist) for contact in contacts), default=0.0)
+
     def contacts(self, q: Floats) -> set[tuple[str, str]]:
         """Pairs of bodies, each in alphabetical order, that are too close at ``q``, for messages to people."""
         self.is_free(q)

@@ -35,6 +35,10 @@ _RESOLUTION = 0.02
 """Largest joint motion between collision checks of a path, radians (metres)."""
 _CHECKS = 15_000
 """Collision checks after which RRT-Connect gives up."""
+_REACHES, _DRAWS = (0.02, 0.05, 0.1, 0.2, 0.4), 50
+"""How far a way out is looked for, standard deviations of each joint in radians (metres), and how often at each."""
+_NO_DEEPER = 5e-4
+"""Metres by which a way out may come closer to what is too close already."""
 _SPLINE_STEP = 0.05
 """Waypoints are densified to this joint distance, so that the spline stays on the checked straight edges."""
 _SAMPLE_TIME = 0.02
@@ -116,6 +120,26 @@ def free_motion(world: CollisionWorld, start: Floats, goal: Floats, rng: np.rand
     with world.ample():
         path = _connect(world, start, goal, rng)
     return _connect(world, start, goal, rng) if path is None else path
+
+
+def onward(world: CollisionWorld, way: Floats | None, goal: Floats, rng: np.random.Generator) -> Floats | None:
+    """A way (W x J) and the free motion from its end to ``goal`` (J); None where either is missing."""
+    rest = None if way is None else free_motion(world, way[-1], goal, rng)
+    return None if way is None or rest is None else np.vstack([way, rest])
+
+
+def way_out(world: CollisionWorld, start: Floats, rng: np.random.Generator) -> Floats | None:
+    """Waypoints (2 x J) from a posture that is too close to something to one near it that is not, no closer on the way.
+
+    None where none is found.
+    """
+    limit = world.depth(start) + _NO_DEEPER
+    for reach in _REACHES:
+        for change in reach * rng.normal(size=(_DRAWS, len(start))):
+            way = np.array([start, np.clip(start + change, world.lower, world.upper)])
+            if world.is_free(way[-1]) and all(world.depth(q) <= limit for q in densify(way, _RESOLUTION)):
+                return way
+    return None
 
 
 def _connect(world: CollisionWorld, start: Floats, goal: Floats, rng: np.random.Generator) -> Floats | None:

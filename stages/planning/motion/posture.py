@@ -13,7 +13,16 @@ from stages.geometry.poses import pose, random_rotations
 from stages.messages import Arrived, Outcome, PostureRequest, RobotCommand, RobotState
 from stages.messages.robot import Guard
 from stages.planning.motion.collision import AMPLE, CollisionWorld
-from stages.planning.motion.motion import arm, free_motion, restarts, robot_command, solve_ik, way_back
+from stages.planning.motion.motion import (
+    arm,
+    free_motion,
+    onward,
+    restarts,
+    robot_command,
+    solve_ik,
+    way_back,
+    way_out,
+)
 from stages.robots import BESIDE, Robot
 from stages.scene.catalogue import Primitive
 
@@ -127,7 +136,10 @@ class PostureRoutine:
         started = state.time
         path = None
         if not state.stopped:
-            path = free_motion(self._world, arm(self._robot, state), self._robot.home, self._rng)
+            q = arm(self._robot, state)
+            path = free_motion(self._world, q, self._robot.home, self._rng)
+            if path is None:
+                path = onward(self._world, way_out(self._world, q, self._rng), self._robot.home, self._rng)
         if path is not None:
             state = yield robot_command(self._robot, "go home", path, guard=Guard(force=_BUMP))
         arrived = path is not None and not state.stopped and not state.shown

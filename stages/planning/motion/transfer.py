@@ -23,9 +23,11 @@ from stages.planning.motion.motion import (
     back_along,
     densify,
     free_motion,
+    onward,
     robot_command,
     straight_motion,
     way_back,
+    way_out,
 )
 from stages.planning.motion.pick_place import (
     LIFT,
@@ -396,7 +398,8 @@ class TransferRoutine:
         return failure
 
     def _home(self, world: CollisionWorld, q: Floats, *, rise: float = 0.0) -> Steps:
-        """Collision-free motion home; after a touch, or where something is too close, from straight above.
+        """Collision-free motion home; after a touch, or where something is too close, from straight above, else from
+        wherever there is room.
 
         ``rise``: metres that the hand goes up first.
         """
@@ -405,19 +408,20 @@ class TransferRoutine:
         path = free_motion(world, q, self._robot.home, self._rng) if path is None else path
         for height in (LIFT, LIFT / 2, LIFT / 4):
             path = self._home_from_above(world, q, height) if path is None else path
+        path = onward(world, way_out(world, q, self._rng), self._robot.home, self._rng) if path is None else path
+        touches = rise > 0 or world.depth(q) > 0
         self._tally.planning_seconds += time.perf_counter() - began
         if path is None:
             return "release", f"no free motion home; too close: {world.contacts(q) or 'nothing'}"
         # Whatever was touched may still be: away from it slowly, and it does not matter if it rubs.
-        speed, force = (SLOW, RUB) if rise else (FAST, _BUMP)
+        speed, force = (SLOW, RUB) if touches else (FAST, _BUMP)
         yield from self._do("go home", path, speed=speed, guard=Guard(force=force))
         self._under_way = None
         return "", ""
 
     def _home_from_above(self, world: CollisionWorld, q: Floats, height: float) -> Floats | None:
         rise = straight_motion(world, q, raised(world.hand(q), height), free=False)
-        onward = None if rise is None else free_motion(world, rise[-1], self._robot.home, self._rng)
-        return None if rise is None or onward is None else np.vstack([rise, onward])
+        return onward(world, rise, self._robot.home, self._rng)
 
     def _world(self) -> CollisionWorld:
         """The scene, with the least margins: for ways home."""

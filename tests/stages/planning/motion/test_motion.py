@@ -11,12 +11,14 @@ from stages.geometry.poses import pose, raised
 from stages.planning.motion.collision import CollisionWorld
 from stages.planning.motion.kinematics import POSITION_TOLERANCE, ROTATION_TOLERANCE
 from stages.planning.motion.motion import (
+    densify,
     free_motion,
     is_motion_free,
     restarts,
     solve_ik,
     straight_motion,
     time_parameterise,
+    way_out,
 )
 from stages.robots import BUILT_IN, read_robot
 from tests.stages.planning.scenes import ROBOT, catalogue, standing, world
@@ -107,6 +109,30 @@ def test_an_arm_whose_encoders_read_beyond_a_limit_finds_a_way(scene: CollisionW
     beyond = HOME.copy()
     beyond[0] = scene.lower[0] - 0.005
     assert free_motion(scene, beyond, HOME, np.random.default_rng(5)) is not None
+
+
+def test_a_hand_that_touches_something_finds_a_way_out_though_it_cannot_rise() -> None:
+    """Somebody put a carton against the hand, which cannot go straight up from there."""
+    leaning = np.array([[-0.206, 0.965, -0.162], [-0.967, -0.226, -0.117], [-0.149, 0.132, 0.980]])
+    scene = world("", cereal_box=pose(leaning, np.array([0.5397, -0.3127, 0.7845])))
+    q = np.array([0.3847, -0.8036, -0.588, 0.307, 1.6126, 0.8445, 0.102, 0.4494])
+    assert scene.contacts(q) == {("cereal_box", "gripper_link")}
+    assert straight_motion(scene, q, raised(scene.hand(q), 0.03), free=False) is None
+    way = way_out(scene, q, np.random.default_rng(0))
+    assert way is not None
+    assert max(scene.depth(between) for between in densify(way, 0.005)) < scene.depth(q) + 1e-3
+    assert free_motion(scene, way[-1], HOME, np.random.default_rng(0)) is not None
+
+
+@settings(max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**31))
+def test_a_way_out_ends_free_and_goes_no_deeper(scene: CollisionWorld, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(scene.lower, scene.upper)
+    way = way_out(scene, q, rng)
+    if way is not None:
+        assert (scene.is_free(way[-1]), way[0].tolist()) == (True, q.tolist())
+        assert max(scene.depth(between) for between in densify(way, 0.005)) < scene.depth(q) + 2e-3
 
 
 def test_trajectories_respect_the_limits() -> None:
