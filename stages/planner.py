@@ -107,7 +107,7 @@ class Planner(Stage):
         engine: str = search.BFS
         """``bfs``, or the name of an installed unified-planning engine."""
         gripper_width: float | None = None
-        """Widest object the gripper takes between its fingers, metres; None: as the robot's description says."""
+        """Widest object the gripper shall take between its fingers, metres; None: as the robot's description says."""
         workspace: Workspace = field(default_factory=Workspace)
 
         def __post_init__(self) -> None:
@@ -124,9 +124,10 @@ class Planner(Stage):
         search.check_engine(config.engine)
         self._handling, self._unknown_objects = Handling, unknown_objects
         self._config = config
-        self._robot = read_robot(config.robot)
+        robot = read_robot(config.robot)
+        widest = min(config.gripper_width or np.inf, robot.gripper.widest)
+        self._robot = replace(robot, gripper=replace(robot.gripper, widest=widest))
         warm_up(self._robot)
-        self._widest = config.gripper_width or self._robot.gripper.widest
         self._catalogue = Catalogue.shared(config.catalogue)
         self._stances = {label: Stances(item) for label, item in self._catalogue.objects.items()}
 
@@ -258,9 +259,10 @@ class Planner(Stage):
         if not grasps:
             return "has no grasp in the catalogue"
         narrowest = min(grasp.width for grasp in grasps)
-        if narrowest <= self._widest:
+        widest = self._robot.gripper.widest
+        if narrowest <= widest:
             return ""
-        return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * self._widest:.1f} cm"
+        return f"is {100 * narrowest:.1f} cm wide and the gripper takes {100 * widest:.1f} cm"
 
     def _check(self, problem: Problem, task: Task, violated: Assertion) -> None:
         """Raises :class:`Impossible` for goals that no search needs to look at."""

@@ -19,7 +19,7 @@ from stages.robots import Robot
 from stages.scene.catalogue import Catalogue
 
 _LOOK = 4
-"""Seconds that pass for others while the robot looks and thinks."""
+"""Seconds that pass while the robot looks and thinks."""
 
 
 class SimulatedRobot(Stage):
@@ -44,6 +44,7 @@ class SimulatedRobot(Stage):
         """The world as it is now, for the simulated camera."""
         for _ in range(_LOOK):
             self._meddle(1.0, ctx)
+            self._simulation.run(1.0)
         rng = np.random.default_rng([self._seed, 3, self._looks])
         self._looks += 1
         return self.snapshot(look_request.purpose, self._wrong.at_a_look(rng))

@@ -577,6 +577,14 @@ def test_what_is_wider_than_the_gripper_is_refused():
     )
 
 
+@pytest.mark.parametrize(
+    ("set_to", "widest"), [(0.06, 0.06), (0.5, ROBOT.gripper.widest), (None, ROBOT.gripper.widest)]
+)
+def test_a_gripper_may_be_set_narrower_than_it_is_and_motions_are_planned_for_that(set_to: float | None, widest: float):
+    planner = Planner(Planner.Config(catalogue=CATALOGUE, gripper_width=set_to))
+    assert planner._robot.gripper.widest == widest  # pyright: ignore[reportPrivateUsage]
+
+
 def test_where_nothing_is_to_be_moved_the_relation_that_does_not_hold_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Problem, "satisfied", lambda _: True)
     violated = satisfied(breakfast().graph(), START.graph(), catalogue())[1]

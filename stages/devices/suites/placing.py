@@ -7,11 +7,16 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from runner.contract import Refused
+from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse, pose
 from stages.robots import Table
 from stages.scene.catalogue import Catalogue, CatalogueObject, Primitive
 from stages.scene.scoring import label_of
+from stages.scene.stance import Stances, Standing
+
+_GRID = 0.01
+"""Metres between the points at which it is seen what is below an object: nothing is slimmer."""
 
 
 def upright(entry: CatalogueObject, x: float, y: float, yaw: float, height: float) -> Floats:
@@ -40,9 +45,12 @@ def moved(
         )
     entry = catalogue[label_of(name, catalogue)]
     others = [(catalogue[label_of(other, catalogue)], T) for other, T in layout.items() if other != name]
-    corners = (np.array([*np.ndindex(3, 3)]) - 1) * entry.dimensions[:2] / 2
-    heights = [_height(other, T, x + dx, y + dy) for dx, dy in corners.tolist() for other, T in others]
-    yaw = np.arctan2(layout[name][1, 0], layout[name][0, 0])
+    yaw = float(np.arctan2(layout[name][1, 0], layout[name][0, 0]))
+    outline = Standing.at(name, Stances(entry), upright(entry, x, y, yaw, table.height)).outline
+    steps = (np.arange(start, stop, _GRID) for start, stop in zip(outline.min(0), outline.max(0), strict=True))
+    grid = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    covered = np.vstack([outline, grid[regions.depth(outline, grid) >= 0]])
+    heights = [_height(other, T, *point) for point in covered.tolist() for other, T in others]
     return upright(entry, x, y, yaw, max([table.height, *heights]))
 
 

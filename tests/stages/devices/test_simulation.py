@@ -1,6 +1,7 @@
 """The simulated world."""
 
 from collections import deque
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,29 @@ def test_what_falls_off_the_table_lies_on_the_floor() -> None:
     (T,) = simulation.object_poses()
     assert np.isfinite(T).all()
     assert 0.0 < T[2, 3] < 0.1
+
+
+def rolling(metres_per_second: float) -> Simulation:
+    """A can that lies in the middle of the table and rolls to the left."""
+    simulation = Simulation(catalogue(), ROBOT, ("soup_can",), TABLE)
+    lying = next(k for k, R in enumerate(catalogue()["soup_can"].resting) if abs(R[2, 2]) < 0.5)
+    simulation.arrange({"soup_can": standing("soup_can", 0.65, 0.1, resting=lying)}, settle=0.5)
+    (T,) = simulation.object_poses()
+    sideways = np.cross([0, 0, 1.0], T[:3, 2])
+    joint = simulation._data.joint("soup_can")  # pyright: ignore[reportPrivateUsage]
+    spin = T[:3, :3].T @ np.cross([0, 0, 1.0], sideways) / (T[2, 3] - TABLE.height)
+    joint.qvel[:] = metres_per_second * np.concatenate([sideways, spin])
+    return simulation
+
+
+def test_a_can_rolls_and_comes_to_rest() -> None:
+    simulation = rolling(0.08)
+    places = [simulation.object_poses()[0][:2, 3]]
+    for _ in range(2):
+        simulation.run(1.0)
+        places.append(simulation.object_poses()[0][:2, 3])
+    first, second = (np.linalg.norm(b - a) for a, b in pairwise(places))
+    assert 0.01 < first < 0.06 and second < 0.003
 
 
 def stacked() -> Simulation:

@@ -224,6 +224,20 @@ def meddled(suite: str, seed: int, *, pieces: int) -> tuple[str, Simulation]:
     return "\n".join(said), world._simulation  # pyright: ignore[reportPrivateUsage]
 
 
+def test_the_world_goes_on_while_the_robot_looks() -> None:
+    """What falls while it looks has fallen at the next look."""
+    world = World(World.Config(suite="tray", seed=0))
+    run_stage(world, [Arrangement(kind="start")])
+    simulation = world._simulation  # pyright: ignore[reportPrivateUsage]
+    name = next(one for one in simulation.present if one != "tray")
+    high = simulation.layout()[name].copy()
+    high[2, 3] += 0.1
+    simulation.add(name, high)
+    (after,) = run_stage(world, [LookRequest(purpose="test")])
+    assert isinstance(after, Snapshot)
+    assert after.T_base_objects[after.names.index(name)][2, 3] < high[2, 3] - 0.05
+
+
 def test_somebody_brings_moves_and_returns_objects_while_the_robot_works() -> None:
     said, simulation = meddled("disturbed", 1, pieces=1600)
     assert "somebody" in said.split("laid out")[1]

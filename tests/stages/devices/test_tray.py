@@ -103,6 +103,15 @@ def test_what_is_moved_is_put_down_on_what_is_below_and_never_beside_the_table()
         moved("tuna_can", (0.2, 0.0), layout, objects, TABLE)
 
 
+@pytest.mark.parametrize(("name", "x", "y"), [("plate", 0.65, 0.0), ("tray", 0.6, 0.05)])
+def test_what_is_wide_is_not_moved_through_what_is_slim(name: str, x: float, y: float) -> None:
+    objects = catalogue()
+    layout = {"water_bottle": standing("water_bottle", 0.70, 0.05), name: standing(name, 0.6, -0.3, yaw=0.4)}
+    T = moved(name, (x, y), layout, objects, TABLE)
+    bottom = T[2, 3] + objects[name].bounds[0, 2]
+    assert bottom == pytest.approx(TABLE.height + objects["water_bottle"].dimensions[2], abs=0.002)
+
+
 def test_what_the_goal_has_beside_the_tray_has_room_beside_it_at_the_start() -> None:
     world = Tray(catalogue(), ROBOT, 420, "tea", 3)
     world.sample("goal", np.random.default_rng([420, 0]))
