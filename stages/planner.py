@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from msgspec.structs import replace as replace_fields
@@ -31,6 +31,9 @@ from stages.scene.domain import DOMAIN
 from stages.scene.facing import sides
 from stages.scene.stance import Stances, Standing, standing_of
 from stages.scene.virtual import fallen, rerooted, satisfied
+
+if TYPE_CHECKING:
+    from stages.planning.handling import Handling
 
 SEARCHES = 16
 """Times that a plan is searched for, each knowing more of what is in the way."""
@@ -211,21 +214,27 @@ class Planner(Stage):
             step = Step(name, scene.supports[name], TABLE)
             poses = targets.of((step,), scene)
             if isinstance(poses, list):
-                return self._uncovering(step, poses[0], scene, problem)
+                return self._uncovering(step, poses[0], scene, problem, handling)
             if isinstance(poses, Blocked):
                 tops = problem.graspable.intersection(poses.obstacles).difference(tried, scene.supports.values())
                 ahead += sorted(tops, reverse=True)
         return _answer("refused", "", reason=f"no room to put {task.aside} aside")
 
-    def _uncovering(self, step: Step, T_base_targets: Floats, scene: Scene, problem: Problem) -> Plan:
-        """The transfer to those places where the object hides nothing of what it hides now."""
+    def _uncovering(
+        self, step: Step, T_base_targets: Floats, scene: Scene, problem: Problem, handling: Handling
+    ) -> Plan:
+        """The transfer to those places where the object hides nothing of what it hides now, from the first on that the
+        hand gets to."""
         item, T_table_base = scene.standing[step.item], inverse(scene.T_base_table)
         stances = self._stances[item.stance.item.name]
         places = ((T, Standing.at(step.item, stances, T_table_base @ T)) for T in T_base_targets)
-        free = [T for T, place in places if scene.eye is None or uncovers(item, place, scene.eye)]
+        free = [(T, place) for T, place in places if scene.eye is None or uncovers(item, place, scene.eye)]
         if not free:
             return _answer("refused", "", reason=f"wherever {step.item} could be put, it would hide the same")
-        chosen = np.stack(free[: self._config.workspace.targets])
+        first = next(handling.of(step, scene, [place for _, place in free]).places(), None)
+        if first is None:
+            return _answer("refused", "", reason=f"no room to put {step.item} aside")
+        chosen = np.stack([T for T, _ in free[first:][: self._config.workspace.targets]])
         return _answer("solved", "", transfers=[_transfer(step, chosen, problem, faces=False)])
 
     def _problem(self, task: Task, held: Sequence[Assertion]) -> Problem:

@@ -825,6 +825,19 @@ def test_what_hides_something_is_put_where_it_hides_nothing_of_that():
         assert hidden_share(behind, [carton], eye) == 0
 
 
+def test_what_hides_something_is_put_where_the_hand_gets_to():
+    current = Layout().put("cereal_box", 0.2, 0.2).put("sugar_box", 0.0, -0.3)
+    goal = Layout(dict(current.poses)).put("salt_shaker", 0.1, 0.0)
+    scene = msgspec.structs.replace(current.graph(), support=regions.rectangle([-0.15, -0.6], [0.55, 0.6]))
+    task = Task(goal_name="goal", goal=goal.graph(), current=scene, aside="cereal_box")
+    (transfer,) = planner().on_task(task, Recorded()).transfers
+    shape = stances("cereal_box")
+    places = [Standing.at("cereal_box", shape, inverse(T_BASE_TABLE) @ T) for T in transfer.T_base_targets]
+    there = Scene.of(scene, {item.name: stances(item.label) for item in scene.objects})
+    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
+    assert next(handling.of(Step("cereal_box", TABLE, TABLE), there, places).places()) == 0
+
+
 def test_what_keeps_the_hand_from_what_hides_something_is_put_aside_first():
     current = Layout().put("salt_shaker", 0.05, 0.0)
     around = {"milk_carton": (-0.04, 0.0), "sugar_box": (0.14, 0.0), "cereal_box": (0.05, 0.1), "tea_box": (0.05, -0.1)}
