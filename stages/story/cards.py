@@ -47,7 +47,18 @@ class Remembered:
 
 
 def card(kept: Remembered, actions: tuple[Action, ...], words: Words) -> Card:
-    """What there is to see of a goal, and beside ``actions`` what can be done with one that is on disk."""
+    """What there is to see of a goal, and beside ``actions`` what can be done with one that is on disk.
+
+    Where that fails it is said: whatever a file holds, the other cards and buttons stay.
+    """
+    try:
+        return _card(kept, actions, words)
+    except Exception as error:
+        name, more = kept.goal.name, () if kept.file is None else tuple(_more(kept.goal.name, words))
+        return Card(name, name, words.say("no_card", reason=f"{type(error).__name__}: {error}"), None, (), more)
+
+
+def _card(kept: Remembered, actions: tuple[Action, ...], words: Words) -> Card:
     goal, name = kept.goal, kept.goal.name
     names = [item.name for item in goal.scene.objects]
     text = words.say("goal" if len(names) > 1 else "goal_of_one", count=len(names), objects=words.nouns(names))

@@ -39,6 +39,10 @@ SAID = {
         "losgelassen, ohne den Stand zu spüren, und seitdem nicht gesehen: die Tasse, nach 3-mal Hinsehen"
     ),
     "name='tea': names no object; teach it again, or restore another one": "in der Szene „tea“ ist nichts",
+    "file: is no goal: it names no object": "in der Szene dieser Datei ist nichts",
+    "what='tea_box': is the only object of the goal; delete the goal instead": (
+        "es ist das einzige Ding, das noch darin ist; löschen Sie stattdessen die Szene"
+    ),
     "unknown: nothing was felt below cup where it was let go of": (
         "unter der Tasse war beim Loslassen nichts zu spüren"
     ),
