@@ -102,17 +102,18 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
             text = words.say(f"is_{found.predicate}", child=noun, supporter=words.noun(found.arguments[1]))
         loose = () if found is None else (strike(str(found), words.say("do_strike")),)
         out = (strike(item.name, words.say("do_leave_out", object=noun)),) if len(scene.objects) > 1 else ()
-        yield Line(f"{text}.", (*loose, *out))
+        yield Line(item.name, f"{text}.", (*loose, *out))
         if is_told(item):
             side = chosen.get(item.name, "any")
-            yield Line(f"{words.say(f'faces_{side}', object=noun)}.", (_face(goal.name, item.name, side, words),))
+            text = words.say(f"faces_{side}", object=noun)
+            yield Line(f"{item.name} faces", f"{text}.", (_face(goal.name, item.name, side, words),))
     for region in scene.virtual_objects:
         parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
         text = words.say("is_beside", **parts, off=round(100 * region.radius))
         radius = min(region.radius + WIDER, MAX_RADIUS)
         wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
         loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
-        yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+        yield Line(region.name, f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
 
 
 def _face(name: str, item: str, side: str, words: Words) -> Action:

@@ -10,7 +10,9 @@ from stages.story.words import words_of
 SAID = {
     "stopped, as asked": "angehalten, wie gewünscht",
     "stopped, as asked; in the hand: tea_box": "angehalten, wie gewünscht; in der Hand ist noch die Teeschachtel",
-    "interactive-20261122-205043: no answer to 'call' within 10 s": "das Programm des Roboters antwortet nicht",
+    "interactive-20261122-205043: no answer to 'call' within 10 s": (
+        "das Programm des Roboters antwortet nicht; ob das bei ihm angekommen ist, weiß niemand"
+    ),
     "question=1: nothing is asked now": "diese Frage ist schon beantwortet",
     "busy: waits for the person's arrangement; ask again after the verdict": (
         "der Roboter ist beschäftigt; warten Sie, bis er fertig ist, oder halten Sie ihn an"
