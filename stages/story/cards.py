@@ -113,7 +113,9 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
         radius = min(region.radius + WIDER, MAX_RADIUS)
         wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
         loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
-        yield Line(region.name, f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+        yield Line(
+            region.name, f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike")))
+        )
 
 
 def _face(name: str, item: str, side: str, words: Words) -> Action:

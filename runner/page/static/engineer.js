@@ -49,7 +49,7 @@ function topics(status) {
 
 /** A command as a form, made from the types of its fields. */
 function form(page, {stage, name, text, fields}) {
-  const key = keyOf(stage, name), reason = page.refused[key], waits = () => page.calling.has(key);
+  const key = keyOf({stage, command: name}), reason = page.refused[key], waits = () => page.calling.has(key);
   const send = (event) => {
     event.preventDefault();
     if (waits()) return;

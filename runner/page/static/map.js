@@ -14,7 +14,7 @@ const KEYS = {ArrowUp: [NUDGE, 0], ArrowDown: [-NUDGE, 0], ArrowLeft: [0, NUDGE]
 let held = null; // what is being moved: {name, from, by}, metres; and the place it was told to have when it was put down
 
 export function map(page, told) {
-  const reason = page.refused[keyOf(told.stage, told.command)];
+  const reason = page.refused[keyOf(told)];
   const points = told.places.flatMap((place) => place.points);
   const xs = points.map(([x]) => x), ys = points.map(([, y]) => y);
   const top = Math.max(...xs) + AROUND, left = Math.max(...ys) + AROUND;
@@ -80,7 +80,7 @@ async function drop(page, told, place) {
   const {name, x, y} = place;
   const own = held = {...held, from: null, put: place};
   await page.call(told.stage, told.command, {name, x: (x + dx).toFixed(3), y: (y + dy).toFixed(3)});
-  setTimeout(() => own === held && release(page), page.refused[keyOf(told.stage, told.command)] ? 0 : SHOWN_MS);
+  setTimeout(() => own === held && release(page), page.refused[keyOf(told)] ? 0 : SHOWN_MS);
 }
 
 function release(page) {

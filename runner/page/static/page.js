@@ -46,7 +46,7 @@ const page = {
   },
 
   /** Calls a declared command of a stage, once its arguments are there; what is refused at once is shown where `key` is. */
-  async call(stage, command, args, key = keyOf(stage, command)) {
+  async call(stage, command, args, key = keyOf({stage, command})) {
     page.refused = {};
     page.calling.add(key);
     page.draw();
@@ -211,7 +211,7 @@ function decoded(part) {
 addEventListener("hashchange", turn);
 addEventListener("keydown", (event) => {
   const stop = stopAction();
-  if (event.key === "Escape" && stop?.now) page.call(stop.stage, stop.command, stop.arguments, keyOf(stop.stage, stop.command, stop.arguments));
+  if (event.key === "Escape" && stop?.now) page.call(stop.stage, stop.command, stop.arguments, keyOf(stop));
 });
 setInterval(() => page.told?.doing.busy && page.draw(), 1000); // the time that has passed
 

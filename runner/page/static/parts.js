@@ -5,20 +5,20 @@ import {repeat} from "./lit-repeat.js";
 
 const MOST_BYTES = 10_000_000; // of a file; what can be imported is not larger
 
-/** What a call is known by: what is asked of whom, but for what a person fills in. */
-export function keyOf(stage, command, args = {}) {
-  return `${stage}.${command} ${JSON.stringify(args)}`;
+/** What an action and its calls are known by: what is asked of whom, and which field a person fills in. */
+export function keyOf({stage, command, arguments: args = {}, ask}) {
+  return `${stage}.${command} ${JSON.stringify(args)} ${ask?.label ?? ""}`;
 }
 
 /** Buttons for actions: each stays the same one, with its focus, whatever comes and goes beside it. */
 export function buttons(page, actions, options) {
-  return repeat(actions, (one) => keyOf(one.stage, one.command, one.arguments), (one) => button(page, one, options));
+  return repeat(actions, keyOf, (one) => button(page, one, options));
 }
 
 /** A button for an action; where it asks for something, a small form. Beside it stands why it was refused. Until it is
  * answered it takes no second press, but for a stop, which can always be tried. */
 export function button(page, action, {shortcut, about} = {}) {
-  const key = keyOf(action.stage, action.command, action.arguments), stops = action.kind === "stop";
+  const key = keyOf(action), stops = action.kind === "stop";
   const reason = page.refused[key], waits = () => page.calling.has(key) && !stops;
   const kind = action.kind === "plain" ? "" : action.kind;
   const send = (event) => {

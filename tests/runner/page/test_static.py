@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -28,7 +29,7 @@ class Server:
 
     def __init__(self, page: Page) -> None:
         self.page = page
-        self.calls = list[dict[str, object]]()
+        self.calls = list[Any]()
         self.asked = list[str]()
         """Paths, as they were sent."""
         self.refusal = ""
@@ -57,7 +58,7 @@ class Server:
 
     def called(self, field: str) -> list[str]:
         """What every call had in a field."""
-        return [one["arguments"][field] for one in self.calls]  # type: ignore[index]
+        return [one["arguments"][field] for one in self.calls]
 
     def _connect(self, socket: WebSocketRoute) -> None:
         self.sockets.append(socket)
@@ -96,11 +97,14 @@ def server(chromium: Browser) -> Iterator[Server]:
 def lamp(name: str, *parts: str) -> s.Card:
     """A card: a lamp that can be lit and labelled, and of which parts can be taken off."""
     light = s.Action("lamp", "light", f"Light {name}", {"name": name})
-    label = s.Action("lamp", "label", "Label", {"name": name}, s.Ask("text", f"Text on {name}"))
+    label, dye = (
+        s.Action("lamp", "change", label, {"name": name}, s.Ask("text", f"{what} {name}"))
+        for label, what in (("Label", "Text on"), ("Dye", "Colour of"))
+    )
     lines = tuple(
         s.Line(part, f"It has {part}.", (s.Action("lamp", "strip", f"Strip {part}", {"part": part}),)) for part in parts
     )
-    return s.Card(name, name, "", None, (light,), (label,), lines, "Parts")
+    return s.Card(name, name, "", None, (light,), (label, dye), lines, "Parts")
 
 
 # ------------------------------------------------------------------------------------------ what comes and goes
@@ -136,11 +140,15 @@ def test_a_button_waits_for_its_answer_but_stop_can_always_be_pressed(server: Se
     light.press("Enter")
     expect(light).to_be_disabled()
     server.page.keyboard.press("Enter")
+    server.page.get_by_text("More foo").press("Enter")
+    for asked in ("Text on foo", "Colour of foo"):
+        server.page.get_by_label(asked).fill("red")
+        server.page.keyboard.press("Enter")
     expect(server.page.get_by_role("button", name="Light bar")).to_be_enabled()
     stop.press("Enter")
     stop.press("Enter")
     server.tell("pressed", lamp("foo"))
-    assert [one["command"] for one in server.calls] == ["light", "off", "off"]
+    assert [one["command"] for one in server.calls] == ["light", "change", "change", "off", "off"]
 
 
 def test_stop_can_be_pressed_while_all_else_waits_for_the_program(server: Server) -> None:
