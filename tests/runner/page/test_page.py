@@ -31,9 +31,9 @@ VIEWS = ("scene", "history", "engineer")
 class Lamp:
     """A run of the lamp and where its page is."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, graph: Path = LAMP) -> None:
         self.folder = folder
-        self.process = start_graph(LAMP, folder=folder)
+        self.process = start_graph(graph, folder=folder)
         self.printed = read_until(self.process, "page: http")
         self.url = re.findall(r"page: (\S+)", self.printed)[0]
         if "processes are ready" not in self.printed:
@@ -443,6 +443,24 @@ def test_a_page_says_that_the_run_has_ended_and_leaves_no_process(
         expect(page.get_by_role("button", name="Blink")).to_be_disabled()
     running.finish()
     wait_until(lambda: not Path(f"/proc/{page_process}").exists())
+
+
+def test_where_nobody_can_tell_the_story_the_page_says_so_and_still_calls(
+    chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    graph = tmp_path / "lamps.yaml"
+    graph.write_text(f"{LAMP.read_text()}  other: {{stage: tests.runner.page.toys:Lamp}}\n")  # the story knows one lamp
+    running = Lamp(tmp_path / "run", graph)
+    with opened(chromium, running.url) as page:
+        expect(page.locator(".banner")).to_contain_text("cannot follow the robot's program any more")
+        page.get_by_role("link", name="Engineer").click()
+        form = page.get_by_role("form", name="lamp blink")
+        form.get_by_label("times").fill("1")
+        form.get_by_role("button").click()
+        expect(page.get_by_text("Answer").first).to_be_visible()
+    running.process.send_signal(signal.SIGINT)
+    running.finish()
 
 
 def children(pid: int, command: str) -> list[int]:
