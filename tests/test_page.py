@@ -116,7 +116,7 @@ def teaches(page: Page) -> None:
     }
     expect(page.get_by_role("region", name="What is there").get_by_role("listitem")).to_have_count(6)
     expect(page.get_by_role("img", name="What stands on, in and next to what").locator("rect")).to_have_count(7)
-    assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth === 640)")
+    page.wait_for_function("[...document.images].every((image) => image.complete && image.naturalWidth === 640)")
     assert faults(page) == []
 
 
@@ -135,7 +135,12 @@ def restores_and_stops(page: Page) -> None:
         expect(page.get_by_role("region", name="Now")).to_contain_text(step)
     expect(page.get_by_role("button", name="Restore")).to_be_disabled()
     page.keyboard.press("Escape")
-    expect(page.get_by_text(re.compile(r"^Stopped, as you asked"))).to_be_visible()
+    stopped = page.get_by_text(re.compile(r"^Stopped, as you asked"))
+    expect(stopped).to_be_visible()
+    page.get_by_role("button", name="Restore").press("Enter")
+    expect(page.get_by_role("button", name="Go", exact=True)).to_be_enabled()
+    page.keyboard.press("Escape")
+    expect(stopped).to_be_visible()
     expect(page.get_by_role("button", name="Restore")).to_be_enabled()
 
 

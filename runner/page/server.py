@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import logging
 import os
 import socket
 import threading
+import time
 import webbrowser
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable
 from functools import partial
@@ -17,7 +17,6 @@ from typing import Literal
 
 import msgspec
 import uvicorn
-from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -31,10 +30,11 @@ from runner.contract import Refused
 from runner.live.live import Live
 from runner.page import viewer
 from runner.page.calls import PageCalls
-from runner.page.feed import Feed, shape
+from runner.page.feed import Feed
 from runner.page.guard import Guard, is_loopback, new_token
 from runner.page.history import past_runs
-from runner.page.past import moments
+from runner.page.past import Past, Pasts
+from runner.page.pictures import jpeg
 from runner.page.story import Language, Photo
 from runner.page.watch import Watch
 from runner.supervise.calls import CallRequest
@@ -44,10 +44,10 @@ from runner.terminal import has_display
 STATIC = Path(__file__).with_name("static")
 STATUS_SECONDS = 1.0
 """Between two questions how the run is, while somebody wants to know."""
+BEAT_SECONDS = 5.0
+"""Between two signs of life, by which a page knows that its connection is no dead one."""
 KEPT_PHOTOS = 8
 """Pictures that are told of no more, and that a page may still ask for."""
-QUALITY = 88
-"""Of JPEG."""
 CLOSE_SECONDS = 1
 NICE = 5
 """The graph comes first."""
@@ -73,8 +73,7 @@ class Page:
         """By every open page."""
         self._photos: dict[str, bytes] = {}
         """JPEG by key."""
-        self._past_photos: tuple[str, dict[str, Photo]] = ("", {})
-        """Of the recording that was told again last."""
+        self._pasts = Pasts()
         self._viewer_files: dict[str, bytes] = {}
         """Of the viewer of the robot in 3D."""
         self._files: dict[str, bytes] = {}
@@ -98,7 +97,7 @@ class Page:
             Route("/runs/{name}/{language}.json", self._past),
             Route("/runs/{name}.rrd", self._drawn),
             Route("/viewer/{name}", self._viewer),
-            Route("/runs/{name}/{key}.jpg", self._past_photo),
+            Route("/runs/{name}/{language}/{key}.jpg", self._past_photo),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ]
 
@@ -109,6 +108,7 @@ class Page:
             async with asyncio.TaskGroup() as group:
                 tasks = [group.create_task(work) for work in (self._tell(), self._ask_how_it_is())]
                 while await run_in_threadpool(is_alive, self._entry):
+                    self._feed.put("beat", int(time.monotonic() / BEAT_SECONDS))
                     await asyncio.sleep(STATUS_SECONDS)
                 for task in tasks:
                     task.cancel()
@@ -141,10 +141,10 @@ class Page:
 
     def _wanted(self, socket: WebSocket) -> Collection[str]:
         if socket not in self._shown:
-            return ("run",)
+            return ("run", "beat")
         shown = self._shown[socket]
         more = ("status", "log", "commands") if shown.view == "engineer" else ()
-        return ("run", f"calls {shown.language}", f"told {shown.language}", *more)
+        return ("run", "beat", "fault", f"calls {shown.language}", f"told {shown.language}", *more)
 
     @property
     def _an_engineer_looks(self) -> bool:
@@ -159,8 +159,9 @@ class Page:
         while True:
             await self._news.wait()
             self._news.clear()
-            if not self._watch.caught_up:  # soon there is news again; what has passed meanwhile is in the history
-                continue
+            self._feed.put("fault", self._watch.fault)
+            if not (self._watch.caught_up or self._watch.fault):
+                continue  # soon there is news again; what has passed meanwhile is in the history
             languages: set[Language] = {shown.language for shown in self._shown.values()}
             for language in languages:
                 told = await run_in_threadpool(self._watch.tell, language)
@@ -190,7 +191,7 @@ class Page:
     def _keep_photos(self, photos: Iterable[Photo]) -> None:
         """Compresses what pages will ask for, each once."""
         past = dict(list(self._photos.items())[-KEPT_PHOTOS:])
-        self._photos = past | {photo.key: self._photos.get(photo.key) or _jpeg(photo) for photo in photos}
+        self._photos = past | {photo.key: self._photos.get(photo.key) or jpeg(photo) for photo in photos}
 
     async def _photo(self, request: Request) -> Response:
         jpeg = self._photos.get(request.path_params["key"])
@@ -224,21 +225,26 @@ class Page:
         return FileResponse(path, filename=path.name)
 
     async def _past(self, request: Request) -> Response:
-        """A recording told again; its pictures are kept until another one is."""
-        path, language = self._recording(request), request.path_params["language"]
+        """A recording told again."""
         try:
-            found, photos = await run_in_threadpool(moments, path, msgspec.convert(language, Language))
+            past = await self._retold(request, grown=False)
         except (Refused, msgspec.ValidationError) as refusal:
             return PlainTextResponse(str(refusal), 422)
-        self._past_photos = (path.stem, photos)
-        return Response(msgspec.json.encode(found, enc_hook=shape), media_type="application/json")
+        return Response(past.moments, media_type="application/json")
 
     async def _past_photo(self, request: Request) -> Response:
-        name, photos = self._past_photos
-        photo = photos.get(request.path_params["key"])
-        if photo is None or name != request.path_params["name"]:
-            return PlainTextResponse("this picture is not kept any more\n", 404)
-        return Response(await run_in_threadpool(_jpeg, photo), media_type="image/jpeg")
+        """A picture of one; where that is not kept any more, it is told again."""
+        try:
+            picture = (await self._retold(request, grown=True)).photos.get(request.path_params["key"])
+        except (Refused, msgspec.ValidationError) as refusal:
+            return PlainTextResponse(str(refusal), 422)
+        if picture is None:
+            return PlainTextResponse("there is no such picture\n", 404)
+        return Response(picture, media_type="image/jpeg")
+
+    async def _retold(self, request: Request, *, grown: bool) -> Past:
+        language = msgspec.convert(request.path_params["language"], Language)
+        return await self._pasts.of(self._recording(request), language, grown=grown)
 
     async def _drawn(self, request: Request) -> Response:
         """A recording for the viewer of the robot in 3D; that of the run that is shown grows as it goes on."""
@@ -283,12 +289,6 @@ class Page:
         """Has something done where the server runs."""
         with contextlib.suppress(RuntimeError):  # it has ended
             self._loop.call_soon_threadsafe(call)
-
-
-def _jpeg(photo: Photo) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(photo.rgb).save(file, "JPEG", quality=QUALITY)
-    return file.getvalue()
 
 
 def serve(entry: Entry, *, address: str, port: int, token: str) -> None:

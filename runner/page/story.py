@@ -145,6 +145,8 @@ class Action:
 class Line:
     """One thing that a card says, with what can be done about it."""
 
+    key: str
+    """The same whatever the text says, and another one for every line of a card."""
     text: str
     actions: tuple[Action, ...]
 

@@ -41,6 +41,8 @@ class Watch:
         self.lines: deque[LogLine] = deque(maxlen=KEPT_LINES)
         self.caught_up = False
         """Whether all was read that there is: before, there is only the past to tell."""
+        self.fault = ""
+        """Why nothing is read any more though the run goes on."""
         self._recording = recording
         self._changed = changed
         self._stopped = stopped
@@ -55,7 +57,16 @@ class Watch:
 
     def start(self) -> None:
         """Begins to read, on a thread of its own."""
-        threading.Thread(target=self.read, name="watch", daemon=True).start()
+        threading.Thread(target=self._follow, name="watch", daemon=True).start()
+
+    def _follow(self) -> None:
+        try:
+            self.read()
+        except Exception as error:
+            self.fault = str(error) or type(error).__name__
+        if self.fault and not self._stopped():
+            print(f"nothing more can be told: {self.fault}", file=sys.stderr)
+            self._changed()
 
     def look(self, somebody: bool) -> None:
         """Goes on where somebody looks, and rests where nobody does."""
@@ -87,9 +98,11 @@ class Watch:
         while not self._recording.exists() and not self._stopped():
             time.sleep(POLL_SECONDS)
         with open_file(self._recording) as file:
-            for record in Container(Growing(file, self._at_end), str(self._recording)):
+            records = Container(Growing(file, self._at_end), str(self._recording))
+            for record in records:
                 self._take(record)
                 self._rest()
+        self.fault = records.damage[-1] if records.torn else ""
 
     def _rest(self) -> bool:
         """Waits while nobody looks; returns whether to stop. The graph itself is read at once: that takes a while."""

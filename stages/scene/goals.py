@@ -143,6 +143,8 @@ def goal_of(name: str, files: Mapping[str, bytes], catalogue: Catalogue) -> Goal
         raise Refused(f"{PDDL}: {refusal}") from None
     except (msgspec.MsgspecError, CodecError, ValueError) as error:
         raise Refused(f"is no goal: {error}") from None
+    if not scene.objects:
+        raise Refused("is no goal: it names no object")
     return goal
 
 
@@ -186,6 +188,8 @@ def without(scene: SceneGraph, what: str) -> SceneGraph:
     regions say where it is on that, so they go with it.
     """
     if what in {item.name for item in scene.objects}:
+        if len(scene.objects) == 1:
+            raise Refused(f"what={what!r}: is the only object of the goal; delete the goal instead")
         regions = {item.name for item in scene.virtual_objects if what in (item.parent, item.child)}
         kept = tuple(item for item in scene.objects if item.name != what)
         return _without(msgspec.structs.replace(scene, objects=kept), {what, *regions})

@@ -47,7 +47,18 @@ class Remembered:
 
 
 def card(kept: Remembered, actions: tuple[Action, ...], words: Words) -> Card:
-    """What there is to see of a goal, and beside ``actions`` what can be done with one that is on disk."""
+    """What there is to see of a goal, and beside ``actions`` what can be done with one that is on disk.
+
+    Where that fails it is said: whatever a file holds, the other cards and buttons stay.
+    """
+    try:
+        return _card(kept, actions, words)
+    except Exception as error:
+        name, more = kept.goal.name, () if kept.file is None else tuple(_more(kept.goal.name, words))
+        return Card(name, name, words.say("no_card", reason=f"{type(error).__name__}: {error}"), None, (), more)
+
+
+def _card(kept: Remembered, actions: tuple[Action, ...], words: Words) -> Card:
     goal, name = kept.goal, kept.goal.name
     names = [item.name for item in goal.scene.objects]
     text = words.say("goal" if len(names) > 1 else "goal_of_one", count=len(names), objects=words.nouns(names))
@@ -91,17 +102,20 @@ def _lines(goal: Goal, words: Words) -> Iterator[Line]:
             text = words.say(f"is_{found.predicate}", child=noun, supporter=words.noun(found.arguments[1]))
         loose = () if found is None else (strike(str(found), words.say("do_strike")),)
         out = (strike(item.name, words.say("do_leave_out", object=noun)),) if len(scene.objects) > 1 else ()
-        yield Line(f"{text}.", (*loose, *out))
+        yield Line(item.name, f"{text}.", (*loose, *out))
         if is_told(item):
             side = chosen.get(item.name, "any")
-            yield Line(f"{words.say(f'faces_{side}', object=noun)}.", (_face(goal.name, item.name, side, words),))
+            text = words.say(f"faces_{side}", object=noun)
+            yield Line(f"{item.name} faces", f"{text}.", (_face(goal.name, item.name, side, words),))
     for region in scene.virtual_objects:
         parts = {"child": words.noun(region.child), "parent": words.noun(region.parent)}
         text = words.say("is_beside", **parts, off=round(100 * region.radius))
         radius = min(region.radius + WIDER, MAX_RADIUS)
         wider = {"name": goal.name, "region": region.name, "radius": f"{radius:.2f}"}
         loosen = Action(GOALS, "loosen", words.say("do_loosen", off=round(100 * radius)), wider)
-        yield Line(f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike"))))
+        yield Line(
+            region.name, f"{text}.", (loosen, strike(f"in({region.name}, {region.child})", words.say("do_strike")))
+        )
 
 
 def _face(name: str, item: str, side: str, words: Words) -> Action:

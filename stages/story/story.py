@@ -45,6 +45,7 @@ from stages.messages import (
     Outcome,
     Pause,
     Plan,
+    Recover,
     Restore,
     SceneEstimate,
     SceneGraph,
@@ -104,7 +105,7 @@ class Job:
     pausing: bool = False
     """The next plan is to wait for go."""
     step_ns: int = 0
-    """When the newest transfer began."""
+    """When the newest transfer began; 0 where somebody was waited for since."""
 
 
 class Story:
@@ -112,7 +113,7 @@ class Story:
 
     hears: tuple[type[Message], ...] = (
         *(Teach, Restore, Look, Stop, Arrange, Arrangement, Move, Kept),
-        *(LookRequest, Frame, SceneEstimate, SceneGraph),
+        *(LookRequest, Recover, Frame, SceneEstimate, SceneGraph),
         *(Goal, Task, Plan, TransferRequest, Outcome, Verdict, AskedQuestion, Answer, Go, Pause),
     )
 
@@ -157,7 +158,7 @@ class Story:
                 self._ask(command, heard)
             case LookRequest(purpose=look) | Frame(name=look) if look.startswith(OWN_ARM):
                 self._at("turn" if look == CAMERAS_WAY else "show")
-            case LookRequest():
+            case LookRequest() | Recover():
                 if not heard.id.startswith(f"{CORRECTOR}."):  # which passes on what was heard before
                     self._begin(heard)
             case Frame() as frame:
@@ -196,14 +197,15 @@ class Story:
             case Plan(transfers=transfers):
                 planned = (*self._job.transfers[: self._job.done], *transfers)
                 waits = bool(transfers) and (self._job.asks or self._job.pausing)
-                self._job = replace(self._job, transfers=planned, waits=waits, asks=False)
+                step_ns = 0 if waits else self._job.step_ns
+                self._job = replace(self._job, transfers=planned, waits=waits, asks=False, step_ns=step_ns)
             case TransferRequest():
                 self._step(heard.time_ns)
-            case Outcome() as outcome:
+            case Outcome(number=number) as outcome if number:  # else the arm came home, or did not
                 self._moved, self._scene = True, None
                 if not outcome.success:
                     self._failed.append((self._job, outcome))
-                self._job = replace(self._job, done=outcome.number)
+                self._job = replace(self._job, done=number)
             case _:
                 self._job = _talked(self._job, heard.message)
 
@@ -225,7 +227,8 @@ class Story:
         return median(self._steps_s) if self._steps_s else STEP_SECONDS
 
     def _begin(self, heard: Heard) -> None:
-        """A look: the first of a job that somebody asked for, or one more of the same."""
+        """A look, or first the way home of an arm that was stopped: the begin of a job that somebody asked for, or one
+        more look of the same."""
         self._caused_look = heard.causes
         asked = [self._asked.pop(cause) for cause in heard.causes if cause in self._asked]
         if asked:
@@ -317,7 +320,7 @@ class Story:
         steps = tuple(_move(transfer, job, words) for transfer in job.transfers)
         step = min(job.done + 1, len(steps))
         expected = 0.0
-        if job.step_ns and not job.waits:
+        if job.step_ns:
             left = (len(steps) - job.done) * self._step_seconds
             expected = (job.step_ns - job.began_ns) * 1e-9 + left
         return Doing(self._what(job, steps, step, words), True, steps, step, job.began_ns, expected)
@@ -422,9 +425,9 @@ class Story:
         yield Action(DEMONSTRATOR, "stop", words.say("do_stop"), {"now": "true"}, kind="stop")
 
     def _map(self, words: Words) -> Map | None:
-        """The scene from above, where people may move what carries nothing."""
+        """The scene from above, where people may move what carries nothing; None where there is nothing to move."""
         scene = self._scene
-        if scene is None or not (self._simulated and self._commanded and self._job is None):
+        if scene is None or not scene.objects or not (self._simulated and self._commanded and self._job is None):
             return None
         carried = support(scene)
         carriers = {supporter for supporter, _ in carried.values()}
@@ -502,7 +505,7 @@ def _talked(job: Job, message: Message) -> Job:
     """A job after what the robot and the person have said to each other."""
     match message:
         case AskedQuestion() as question:
-            return replace(job, question=question)
+            return replace(job, question=question, step_ns=0)
         case Answer(question=number, choice=choice):
             asked = job.question
             taken = asked is not None and asked.number == number and choice in asked.doubt.choices

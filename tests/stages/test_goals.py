@@ -27,7 +27,7 @@ from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.goals import packed, without
 from stages.scene.virtual import satisfied
 from tests.stages.episodes import Recorded, scene
-from tests.stages.story.test_story import frame
+from tests.stages.story.test_story import NOTHING, frame
 
 TEA = scene({"tray": "table", "cup": "tray", "tea_box": "table"}, beside={"tea_box": "tray"})
 
@@ -113,6 +113,7 @@ def test_a_goal_goes_to_another_robot(tmp_path: Path) -> None:
         ({"tea/other.txt": b""}, "it has neither scene.json nor goal.pddl"),
         ({"tea/scene.json": b"{}"}, "missing required field `objects`"),
         ({"tea/scene.json": b'{"objects": 1'}, "is no goal"),
+        (packed(Goal(name="tea", scene=NOTHING, pddl="")), "it names no object"),
         ({"../scene.json": b"{}"}, "is no goal"),
         ({"tea/scene.json": b"0" * 20_000_000}, "more than 10000000 bytes"),
     ],
@@ -127,6 +128,17 @@ def test_what_is_no_goal_is_refused(tmp_path: Path, content: bytes | dict[str, b
     with pytest.raises(Refused, match=f"file: is no goal.*{reason}|file: {reason}"):
         Robot(tmp_path / "goals").called(Add(file=content))
     assert not (tmp_path / "goals").exists()
+
+
+def test_the_last_object_of_a_goal_is_not_left_out(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.taught("tea")
+    first, *others = (item.name for item in TEA.objects)
+    for name in others:
+        robot.called(Strike(name="tea", what=name))
+    with pytest.raises(Refused, match=rf"what='{first}': is the only object of the goal; delete the goal instead"):
+        robot.called(Strike(name="tea", what=first))
+    assert [item.name for item in robot.scene().objects] == [first]
 
 
 def test_what_lies_beside_the_goals_is_named_and_left_alone(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 // For the engineer: processes, topics, commands as forms, and the log of any graph.
 
 import {html, nothing} from "./lit-html.js";
-import {lasted, size} from "./parts.js";
+import {keyOf, lasted, size} from "./parts.js";
 
 export function engineer(page) {
   if (!page.status) return html`<p class="quiet">${page.say("waiting")}</p>`;
@@ -49,18 +49,19 @@ function topics(status) {
 
 /** A command as a form, made from the types of its fields. */
 function form(page, {stage, name, text, fields}) {
+  const key = keyOf({stage, command: name}), reason = page.refused[key], waits = () => page.calling.has(key);
   const send = (event) => {
     event.preventDefault();
+    if (waits()) return;
     const filled = [...new FormData(event.target)].filter(([, value]) => value !== "");
     const ticked = fields.filter((field) => field.type === "bool" && !filled.some(([key]) => key === field.name));
     page.call(stage, name, Object.fromEntries([...filled, ...ticked.map((field) => [field.name, "false"])]));
   };
-  const reason = page.refused[`${stage}.${name}`];
   return html`<form class="command" @submit=${send} aria-label="${stage} ${name}">
     <h3>${stage} <b>${name}</b></h3><p class="quiet">${text}</p>
     ${fields.map((field) => html`<label>${field.name} ${input(field)}
       ${field.text ? html`<span class="hint">${field.text}</span>` : nothing}</label>`)}
-    <button ?disabled=${!page.ready}>${page.say("call")}<span class="unseen"> ${stage} ${name}</span></button>
+    <button ?disabled=${!page.ready} aria-disabled=${waits() ? "true" : nothing}>${page.say("call")}<span class="unseen"> ${stage} ${name}</span></button>
     ${reason ? html`<p class="refused" role="alert">${reason}</p>` : nothing}
   </form>`;
 }

@@ -1,10 +1,12 @@
 // The recordings beside the running one, and one of them told again.
 
+import {asked} from "./asked.js";
 import {html, nothing} from "./lit-html.js";
 import {engineers, lasted, size, solid} from "./parts.js";
 import {notice, question, statements, view} from "./scene.js";
 
 const WORDS = {COMPLETE: "complete", INCOMPLETE: "incomplete"};
+const READING_MS = 120_000; // that a recording may take to be read
 const LONGEST_MS = 2000; // that a moment is shown while it plays
 
 export function history(page) {
@@ -16,28 +18,49 @@ function list(page) {
   const when = new Intl.DateTimeFormat(page.language, {dateStyle: "medium", timeStyle: "short"});
   return html`<section aria-labelledby="runs"><h2 id="runs">${page.say("runs")}</h2>
     <p class="quiet">${page.say("runs_hint")}</p>
+    ${page.unread ? unread(page, page.unread, () => listed(page)) : nothing}
     <ul class="runs">${runs.map((run) => html`<li>
       <b>${when.format(new Date(1000 * run.started))}</b>
       <span>${run.graph || run.name}</span>
       <span>${run.running ? page.say("running") : lasted(run.seconds)}</span>
       <span class="sure ${run.verdict === "COMPLETE" ? "sure" : run.running ? "unsure" : "doubtful"}">
         ${run.running ? page.say("being_written") : page.say(WORDS[run.verdict] ?? "torn")}</span>
-      <span><a href="#history/${run.name}">${page.say("replay")}<span class="unseen"> ${run.name}</span></a>
-      ${run.running ? nothing : html` · <a href="runs/${run.name}.mcap" download
+      <span><a href="#history/${encodeURIComponent(run.name)}">${page.say("replay")}<span class="unseen"> ${run.name}</span></a>
+      ${run.running ? nothing : html` · <a href="runs/${encodeURIComponent(run.name)}.mcap" download
         >${page.say("download", {size: size(run.bytes)})}<span class="unseen"> ${run.name}</span></a>`}</span>
     </li>`)}</ul></section>`;
+}
+
+/** Asks for the list. */
+export async function listed(page) {
+  page.unread = "";
+  try {
+    page.runs = JSON.parse(await asked(page, "runs"));
+  } catch (error) {
+    page.unread = error.message;
+  }
+  page.draw();
+}
+
+/** Why something could not be read, and a button that tries again. */
+function unread(page, reason, again) {
+  return html`<p class="refused" role="alert">${reason}</p><p><button @click=${again}>${page.say("again")}</button></p>`;
 }
 
 // ------------------------------------------------------------------------------------------ one of them again
 
 /** Asks for a recording's moments, and shows the one that a message brought about, or the first. */
 export async function replay(page, name, message) {
-  if (page.past?.name !== name || page.past.language !== page.language) {
+  if (page.past?.name !== name || page.past.language !== page.language || page.past.refused) {
     const past = {name, language: page.language, moments: null, at: page.past?.at ?? 0, refused: ""};
     page.past = past;
     page.draw();
-    const answer = await fetch(`runs/${name}/${past.language}.json`);
-    past[answer.ok ? "moments" : "refused"] = await (answer.ok ? answer.json() : answer.text());
+    const path = `runs/${encodeURIComponent(name)}/${past.language}.json`;
+    try {
+      past.moments = JSON.parse(await asked(page, path, {patience: READING_MS}));
+    } catch (error) {
+      past.refused = error.message;
+    }
     if (page.past !== past) return; // something else was asked for meanwhile
   }
   const found = page.past.moments?.findIndex((moment) => moment.message === message) ?? -1;
@@ -48,12 +71,12 @@ export async function replay(page, name, message) {
 
 function replayed(page, past) {
   const back = html`<p><a href="#history">${page.say("back")}</a></p>`;
-  if (past.refused) return html`${back}<p class="refused" role="alert">${past.refused}</p>`;
+  if (past.refused) return html`${back}${unread(page, past.refused, () => replay(page, past.name))}`;
   if (!past.moments) return html`${back}<p class="quiet" role="status">${page.say("reading")}</p>`;
   const moment = past.moments[past.at];
   if (!moment) return html`${back}<p class="quiet">${page.say("nothing_told")}</p>`;
   const to = (at) => { past.at = at; page.draw(); };
-  const shown = {...page, told: moment, photos: `runs/${past.name}`};
+  const shown = {...page, told: moment, photos: `runs/${encodeURIComponent(past.name)}/${past.language}`};
   return html`${back}<div class="scene">
     <div class="seen">${view(shown, moment.view)}
       <section class="player" aria-label=${page.say("replay")}>

@@ -1,6 +1,8 @@
 // Things seen from above, to be moved by mouse, finger or keys.
 
 import {html, nothing, svg} from "./lit-html.js";
+import {repeat} from "./lit-repeat.js";
+import {keyOf} from "./parts.js";
 
 const MM = 1000; // drawn in millimetres
 const AROUND = 0.2; // metres about the things
@@ -12,6 +14,7 @@ const KEYS = {ArrowUp: [NUDGE, 0], ArrowDown: [-NUDGE, 0], ArrowLeft: [0, NUDGE]
 let held = null; // what is being moved: {name, from, by}, metres; and the place it was told to have when it was put down
 
 export function map(page, told) {
+  const reason = page.refused[keyOf(told)];
   const points = told.places.flatMap((place) => place.points);
   const xs = points.map(([x]) => x), ys = points.map(([, y]) => y);
   const top = Math.max(...xs) + AROUND, left = Math.max(...ys) + AROUND;
@@ -19,11 +22,10 @@ export function map(page, told) {
   return html`<section class="rearrange" aria-labelledby="map"><h2 id="map">${told.title}</h2>
     <svg class="map" viewBox="${-left * MM} ${-top * MM} ${wide * MM} ${tall * MM}" role="group" aria-labelledby="map" aria-describedby="map-hint">
       <path class="ground" d=${outline(told.ground)}></path>
-      ${told.places.map((place) => thing(page, told, place))}
+      ${repeat(told.places, (place) => place.name, (place) => thing(page, told, place))}
     </svg>
     <p class="hint" id="map-hint">${told.hint}</p>
-    ${page.refused[`${told.stage}.${told.command}`]
-      ? html`<p class="refused" role="alert">${page.refused[`${told.stage}.${told.command}`]}</p>` : nothing}
+    ${reason ? html`<p class="refused" role="alert">${reason}</p>` : nothing}
   </section>`;
 }
 
@@ -78,7 +80,7 @@ async function drop(page, told, place) {
   const {name, x, y} = place;
   const own = held = {...held, from: null, put: place};
   await page.call(told.stage, told.command, {name, x: (x + dx).toFixed(3), y: (y + dy).toFixed(3)});
-  setTimeout(() => own === held && release(page), page.refused[`${told.stage}.${told.command}`] ? 0 : SHOWN_MS);
+  setTimeout(() => own === held && release(page), page.refused[keyOf(told)] ? 0 : SHOWN_MS);
 }
 
 function release(page) {

@@ -1,14 +1,16 @@
 // The page: what it is told over one connection, what it shows of that, and what it asks for.
 
-import {html, nothing, render} from "./lit-html.js";
+import {asked} from "./asked.js";
 import {engineer} from "./engineer.js";
-import {history, replay} from "./history.js";
-import {button} from "./parts.js";
+import {history, listed, replay} from "./history.js";
+import {html, nothing, render} from "./lit-html.js";
+import {button, keyOf} from "./parts.js";
 import {scene} from "./scene.js";
 
 const LANGUAGES = {en: "English", de: "Deutsch"};
 const VIEWS = {scene, history, engineer};
-const AGAIN_MS = 1000; // until a connection that was lost is tried again
+const AGAIN_MS = 1000; // until what was lost is tried again
+const SILENT_MS = 15_000; // without a word, after which a connection counts as lost; the server says something every 5 s
 
 const root = document.getElementById("page");
 
@@ -21,15 +23,17 @@ const page = {
   told: null, // by whoever tells the story of this graph
   run: null,
   calls: [],
-  calling: 0, // calls that nobody has taken yet
+  calling: new Set(), // calls that nobody has taken yet, by key
   commands: [],
   status: null,
   log: [],
   runs: null, // recordings; null until they were asked for
+  unread: "", // why they could not be listed
   past: null, // the recording that is told again: its name, its moments, the one that is shown
   solid: false, // whether the robot is shown in 3D
+  fault: "", // why nothing new is told any more
   marked: "", // the outline that is pointed at
-  refused: {}, // why a command could not be called, by stage.command
+  refused: {}, // why the newest call was not possible, by key
 
   /** Whether there is somebody to ask. */
   get ready() {
@@ -41,20 +45,19 @@ const page = {
     return (page.texts[key] ?? key).replace(/\{(\w+)\}/g, (_, word) => words[word] ?? "");
   },
 
-  /** Calls a declared command of a stage; what is refused at once is shown beside it. */
-  async call(stage, command, args) {
-    const name = `${stage}.${command}`;
-    delete page.refused[name];
-    page.calling += 1;
+  /** Calls a declared command of a stage, once its arguments are there; what is refused at once is shown where `key` is. */
+  async call(stage, command, args, key = keyOf({stage, command})) {
+    page.refused = {};
+    page.calling.add(key);
     page.draw();
     try {
-      const body = JSON.stringify({stage, command, arguments: args});
-      const answer = await fetch("call", {method: "POST", body, headers: {"accept-language": page.language}});
-      if (!answer.ok) page.refused[name] = await answer.text();
-    } catch {
-      page.refused[name] = page.say("lost");
+      const body = JSON.stringify({stage, command, arguments: await args});
+      const headers = {"accept-language": page.language};
+      await asked(page, "call", {method: "POST", body, headers, unanswered: "unknown_whether"});
+    } catch (error) {
+      page.refused[key] = error.message;
     }
-    page.calling -= 1;
+    page.calling.delete(key);
     page.draw();
   },
 
@@ -83,7 +86,7 @@ function whole() {
       ${banner()}
       ${VIEWS[page.view](page)}
     </main>
-    <footer>${page.run ? html`<a href="#history/${page.run.name}">${page.run.name}</a>` : nothing}</footer>`;
+    <footer>${page.run ? html`<a href="#history/${encodeURIComponent(page.run.name)}">${page.run.name}</a>` : nothing}</footer>`;
 }
 
 function tab(name) {
@@ -101,6 +104,7 @@ function stopButton() {
 
 function banner() {
   if (!page.connected) return page.met ? html`<p class="banner bad" role="alert">${page.say("lost")}</p>` : nothing;
+  if (page.fault) return html`<p class="banner bad" role="alert">${page.say("broken", {reason: page.fault})}</p>`;
   if (page.run?.state === "starting") {
     return html`<p class="banner" role="status">${page.say("starting", {waits: page.run.waits.join(", ")})}</p>`;
   }
@@ -119,24 +123,36 @@ let socket = null;
 function connect() {
   const place = new URL("live", location.href);
   place.protocol = place.protocol.replace("http", "ws");
-  socket = new WebSocket(place);
-  socket.onopen = () => {
+  const own = socket = new WebSocket(place);
+  let silence = 0;
+  const lose = () => {
+    clearTimeout(silence);
+    own.onopen = own.onmessage = own.onclose = null;
+    own.close();
+    page.connected = false;
+    page.draw();
+    setTimeout(connect, AGAIN_MS);
+  };
+  const wait = () => {
+    clearTimeout(silence);
+    silence = setTimeout(lose, SILENT_MS);
+  };
+  wait();
+  own.onopen = () => {
     page.connected = page.met = true;
+    page.refused = {};
     tell();
     page.draw();
   };
-  socket.onmessage = (event) => {
+  own.onmessage = (event) => {
+    wait();
     const {name, value} = JSON.parse(event.data);
     const [key, language] = name.split(" ");
     if (language && language !== page.language) return;
     page[key] = value;
     page.draw();
   };
-  socket.onclose = () => {
-    page.connected = false;
-    page.draw();
-    setTimeout(connect, AGAIN_MS);
-  };
+  own.onclose = lose;
 }
 
 /** Says what this page shows, and so wants to be told. */
@@ -144,19 +160,34 @@ function tell() {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({view: page.view, language: page.language}));
 }
 
+let chosen = "";
+
 async function choose(language) {
-  page.language = language;
+  chosen = language;
+  const texts = await textsOf(language);
+  if (chosen !== language) return; // another one was chosen meanwhile
+  Object.assign(page, {language, texts});
   localStorage.setItem("language", language);
   document.documentElement.lang = language;
-  page.texts = await (await fetch(`${language}.json`)).json();
   document.title = page.say("title");
   tell();
   page.draw();
   if (page.past) await replay(page, page.past.name);
 }
 
+/** The texts of a language, asked for until they are there: before, there is nothing to say. */
+async function textsOf(language) {
+  for (;;) {
+    try {
+      return JSON.parse(await asked(page, `${language}.json`));
+    } catch {
+      await new Promise((again) => setTimeout(again, AGAIN_MS));
+    }
+  }
+}
+
 async function turn() {
-  const [wanted, name, message] = decodeURIComponent(location.hash.slice(1)).split("/");
+  const [wanted, name, message] = location.hash.slice(1).split("/").map(decoded);
   page.view = wanted in VIEWS ? wanted : "scene";
   if (!name) page.past = null;
   tell();
@@ -164,15 +195,23 @@ async function turn() {
   if (name) {
     await replay(page, name, message);
   } else if (page.view === "history") {
-    page.runs = await (await fetch("runs")).json();
-    page.draw();
+    await listed(page);
+  }
+}
+
+/** A part of an address as it was before it was encoded; what was not stays as it is. */
+function decoded(part) {
+  try {
+    return decodeURIComponent(part);
+  } catch {
+    return part;
   }
 }
 
 addEventListener("hashchange", turn);
 addEventListener("keydown", (event) => {
   const stop = stopAction();
-  if (event.key === "Escape" && stop?.now) page.call(stop.stage, stop.command, stop.arguments);
+  if (event.key === "Escape" && stop?.now) page.call(stop.stage, stop.command, stop.arguments, keyOf(stop));
 });
 setInterval(() => page.told?.doing.busy && page.draw(), 1000); // the time that has passed
 

@@ -1,33 +1,48 @@
 // What several views show alike.
 
 import {html, nothing} from "./lit-html.js";
+import {repeat} from "./lit-repeat.js";
 
-/** A button for an action; where it asks for something, a small form. Beside it stands why it was refused. */
+const MOST_BYTES = 10_000_000; // of a file; what can be imported is not larger
+
+/** What an action and its calls are known by: what is asked of whom, and which field a person fills in. */
+export function keyOf({stage, command, arguments: args = {}, ask}) {
+  return `${stage}.${command} ${JSON.stringify(args)} ${ask?.label ?? ""}`;
+}
+
+/** Buttons for actions: each stays the same one, with its focus, whatever comes and goes beside it. */
+export function buttons(page, actions, options) {
+  return repeat(actions, keyOf, (one) => button(page, one, options));
+}
+
+/** A button for an action; where it asks for something, a small form. Beside it stands why it was refused. Until it is
+ * answered it takes no second press, but for a stop, which can always be tried. */
 export function button(page, action, {shortcut, about} = {}) {
-  const reason = page.refused[`${action.stage}.${action.command}`];
+  const key = keyOf(action), stops = action.kind === "stop";
+  const reason = page.refused[key], waits = () => page.calling.has(key) && !stops;
   const kind = action.kind === "plain" ? "" : action.kind;
-  const send = async (event) => {
+  const send = (event) => {
     event.preventDefault();
-    if (action.confirm && !confirm(action.confirm)) return;
-    const form = event.target, args = {...action.arguments};
-    if (action.ask) args[action.ask.field] = await filled(new FormData(form).get("asked"));
-    page.call(action.stage, action.command, args);
-    form.reset();
+    if (waits() || (action.confirm && !confirm(action.confirm))) return;
+    page.call(action.stage, action.command, filled(page, action, new FormData(event.target)), key);
+    event.target.reset();
   };
   return html`<form class="action ${kind}" @submit=${send}>
     ${action.ask ? field(action, about) : nothing}
-    <button class=${kind} ?disabled=${!action.now || !page.ready}
+    <button class=${kind} ?disabled=${!action.now || !(page.ready || stops)} aria-disabled=${waits() ? "true" : nothing}
       aria-keyshortcuts=${shortcut ?? nothing} aria-describedby=${about ?? nothing} title=${shortcut ? page.say("shortcut", {key: shortcut}) : nothing}
       >${action.label}</button>
     ${reason ? html`<p class="refused" role="alert">${page.say("refused")} ${reason}</p>` : nothing}
   </form>`;
 }
 
-/** What was typed, or the content of a file as base64. */
-async function filled(value) {
-  if (!(value instanceof File)) return value;
+/** The arguments of an action with what was typed, or the content of a file as base64. */
+async function filled(page, {ask, arguments: args}, form) {
+  const value = form.get("asked");
+  if (!ask || !(value instanceof File)) return ask ? {...args, [ask.field]: value} : args;
+  if (value.size > MOST_BYTES) throw new Error(page.say("too_large", {size: size(value.size), most: size(MOST_BYTES)}));
   const bytes = new Uint8Array(await value.arrayBuffer());
-  return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+  return {...args, [ask.field]: btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""))};
 }
 
 function field({ask, command}, about) {
@@ -62,7 +77,7 @@ export function size(bytes) {
 /** The robot and what it sees in 3D, in Rerun's viewer: large, so only once it is wanted, which `holder.solid` says. */
 export function solid(page, holder, recording) {
   const wanted = () => { holder.solid = !holder.solid; page.draw(); };
-  const drawing = new URL(`runs/${recording}.rrd`, location.href).href.split("#")[0];
+  const drawing = new URL(`runs/${encodeURIComponent(recording)}.rrd`, location.href).href.split("#")[0];
   return html`<section class="solid" aria-label=${page.say("solid")}>
     <button aria-expanded=${holder.solid ? "true" : "false"} @click=${wanted}>${page.say("solid")}</button>
     ${holder.solid ? html`<p class="quiet">${page.say("solid_hint")}</p><iframe title=${page.say("solid")}

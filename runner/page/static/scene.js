@@ -2,8 +2,9 @@
 
 import {html, nothing, svg} from "./lit-html.js";
 import {graph} from "./graph.js";
+import {repeat} from "./lit-repeat.js";
 import {map} from "./map.js";
-import {button, engineers, lasted, solid} from "./parts.js";
+import {buttons, engineers, lasted, solid} from "./parts.js";
 
 const WIDE = 8, TALL = 21; // of the letters of a name, in pixels of a picture of 640
 const BOW = 50; // by which an arrow rises, in the same pixels
@@ -18,7 +19,7 @@ export function scene(page) {
     <div class="said">
       ${doing(page, told)}
       ${offered.length ? html`<section aria-labelledby="do"><h2 id="do">${page.say("do")}</h2>
-        ${offered.map((action) => button(page, action))}</section>` : nothing}
+        ${buttons(page, offered)}</section>` : nothing}
     </div>
     ${statements(page, told)}
     ${told.map ? map(page, told.map) : nothing}
@@ -106,7 +107,7 @@ function doing(page, told) {
       expected_s > past ? page.say("left", {time: lasted(expected_s - past)}) : ""].filter(Boolean).join(" · ")}</p>
     ${question(page, told.question)}
     ${notice(page, told.notice)}
-    ${page.calling || (newest && !newest.done && !busy) ? html`<p class="quiet" role="status">${page.say("passed_on")}</p>` : nothing}
+    ${page.calling.size || (newest && !newest.done && !busy) ? html`<p class="quiet" role="status">${page.say("passed_on")}</p>` : nothing}
     ${newest?.refused
       ? html`<p class="refused" role="alert">${page.say("refused")} ${newest.refused}</p>` : nothing}
   </section>`;
@@ -116,7 +117,7 @@ function doing(page, told) {
 export function question(page, question) {
   if (!question) return nothing;
   return html`<div class="question" role="alert"><p>${question.text}</p>
-    <div class="answers">${question.answers.map((action) => button(page, action))}</div></div>`;
+    <div class="answers">${buttons(page, question.answers)}</div></div>`;
 }
 
 export function notice(page, notice, run = page.run?.name) {
@@ -127,7 +128,7 @@ export function notice(page, notice, run = page.run?.name) {
     ${notice.help.length ? html`<ul>${notice.help.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
     ${title ? html`<p>${title}</p><ul>${tried.map((line) => html`<li>${line}</li>`)}</ul>` : nothing}
     ${notice.good || !notice.message || !run ? nothing : html`
-      <p><a href="#history/${run}/${notice.message}">${page.say("see_moment")}</a></p>
+      <p><a href="#history/${encodeURIComponent(run)}/${encodeURIComponent(notice.message)}">${page.say("see_moment")}</a></p>
       ${engineers(page, notice.message, run)}`}
   </div>`;
 }
@@ -135,8 +136,8 @@ export function notice(page, notice, run = page.run?.name) {
 function cards(page, told) {
   return html`<section class="cards" aria-labelledby="cards"><h2 id="cards">${told.cards_title}</h2>
     ${told.cards.length ? nothing : html`<p class="quiet">${told.cards_hint}</p>`}
-    <ul>${told.cards.map((one) => card(page, one))}</ul>
-    ${told.cards_actions.map((action) => button(page, action))}</section>`;
+    <ul>${repeat(told.cards, (one) => one.key, (one) => card(page, one))}</ul>
+    ${buttons(page, told.cards_actions)}</section>`;
 }
 
 /** To what the robot does now: there it goes on, for the keyboard too. */
@@ -151,13 +152,13 @@ function card(page, card) {
     ${card.photo ? html`<img src="photo/${card.photo.key}.jpg" alt=${card.title} loading="lazy">` : nothing}
     <h3>${card.title}</h3><p>${card.text}</p>
     <div @submit=${upwards}>
-      ${card.actions.map((action) => button(page, action))}</div>
+      ${buttons(page, card.actions)}</div>
     ${card.lines.length ? html`<details><summary>${card.lines_title}<span class="unseen"> ${card.title}</span></summary>
-      <ul class="lines">${card.lines.map((line, k) => html`<li><span id="line-${card.key}-${k}">${line.text}</span>
-        <span class="small">${line.actions.map((action) => button(page, action, {about: `line-${card.key}-${k}`}))}</span>
+      <ul class="lines">${repeat(card.lines, (line) => line.key, (line, k) => html`<li><span id="line-${card.key}-${k}">${line.text}</span>
+        <span class="small">${buttons(page, line.actions, {about: `line-${card.key}-${k}`})}</span>
       </li>`)}</ul></details>` : nothing}
     ${card.more.length || card.file ? html`<details><summary>${page.say("more")}<span class="unseen"> ${card.title}</span></summary>
       ${card.file ? html`<a class="button" href="file/${card.file.key}" download=${card.file.name}>${card.file.label}</a>` : nothing}
-      ${card.more.map((action) => button(page, action))}</details>` : nothing}
+      ${buttons(page, card.more)}</details>` : nothing}
   </li>`;
 }

@@ -6,6 +6,7 @@ import http.client
 import json
 import re
 import signal
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -30,9 +31,9 @@ VIEWS = ("scene", "history", "engineer")
 class Lamp:
     """A run of the lamp and where its page is."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, graph: Path = LAMP) -> None:
         self.folder = folder
-        self.process = start_graph(LAMP, folder=folder)
+        self.process = start_graph(graph, folder=folder)
         self.printed = read_until(self.process, "page: http")
         self.url = re.findall(r"page: (\S+)", self.printed)[0]
         if "processes are ready" not in self.printed:
@@ -334,6 +335,23 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     assert [asked(lamp.url, f"{path}runs/{one}")[0] for one in (f"{run}/fr.json", "nothing/en.json")] == [422, 404]
 
 
+def test_who_looks_at_another_recording_takes_nobodys_pictures_away(lamp: Lamp) -> None:
+    path = urlsplit(lamp.url).path
+    (recording,) = lamp.folder.rglob("*.mcap")
+    other = recording.with_name("other.mcap")
+    other.write_bytes(recording.read_bytes())
+    try:
+        for name in (recording.stem, other.stem):
+            moments = json.loads(asked(lamp.url, f"{path}runs/{name}/en.json")[1])
+            assert moments[0]["view"]["photo"] == {"key": "lamp.picture-0", "rgb": [48, 64, 3]}
+        for name in (recording.stem, other.stem):
+            assert asked(lamp.url, f"{path}runs/{name}/en/lamp.picture-0.jpg")[0] == 200
+        assert asked(lamp.url, f"{path}runs/{other.stem}/de/lamp.picture-0.jpg")[0] == 200
+        assert asked(lamp.url, f"{path}runs/{other.stem}/en/lamp.picture-1.jpg")[0] == 404
+    finally:
+        other.unlink()
+
+
 def test_the_robot_in_3d_comes_from_the_same_address_and_calls_nobody_else(lamp: Lamp, page: Page) -> None:
     path = urlsplit(lamp.url).path
     status, html = asked(lamp.url, f"{path}viewer/index.html")
@@ -369,6 +387,32 @@ def test_a_story_that_fails_takes_no_button_away(
     assert "nothing new can be told: AttributeError: 'LampStory'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("how", ["story", "damage"])
+def test_why_nothing_more_is_read_is_known(
+    lamp: Lamp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    (recording,) = lamp.folder.rglob("*.mcap")
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(recording.read_bytes()[:-3])
+    if how == "story":
+        monkeypatch.delattr(LampStory, "__init__")
+    watch = Watch(broken, lambda: None, lambda: False)
+    watch.look(True)
+    watch.start()
+    wait_until(lambda: watch.fault)
+    assert ("takes no arguments" if how == "story" else "the file ends inside a record") in watch.fault
+
+
+def test_a_page_that_hears_nothing_new_is_told_that_the_server_lives(lamp: Lamp) -> None:
+    place, heard = urlsplit(lamp.url), defaultdict[str, list[object]](list)
+    with connect(f"ws://{place.netloc}{place.path}live", max_size=None) as socket:
+        socket.send(json.dumps({"view": "scene", "language": "en"}))
+        while len(heard["beat"]) < 2 or not heard["told en"]:
+            said = json.loads(socket.recv(timeout=60))
+            heard[said["name"]].append(said["value"])
+    assert heard["fault"] == [""]
+
+
 def test_what_is_kept_is_listed_in_the_terminal_too(lamp: Lamp) -> None:
     assert runner("goals").communicate(timeout=60)[0] == (
         "A lamp\n    It blinks.\n    runner call lamp blink times=10\n    runner call lamp switch note=...\n"
@@ -399,6 +443,24 @@ def test_a_page_says_that_the_run_has_ended_and_leaves_no_process(
         expect(page.get_by_role("button", name="Blink")).to_be_disabled()
     running.finish()
     wait_until(lambda: not Path(f"/proc/{page_process}").exists())
+
+
+def test_where_nobody_can_tell_the_story_the_page_says_so_and_still_calls(
+    chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    graph = tmp_path / "lamps.yaml"
+    graph.write_text(f"{LAMP.read_text()}  other: {{stage: tests.runner.page.toys:Lamp}}\n")  # the story knows one lamp
+    running = Lamp(tmp_path / "run", graph)
+    with opened(chromium, running.url) as page:
+        expect(page.locator(".banner")).to_contain_text("cannot follow the robot's program any more")
+        page.get_by_role("link", name="Engineer").click()
+        form = page.get_by_role("form", name="lamp blink")
+        form.get_by_label("times").fill("1")
+        form.get_by_role("button").click()
+        expect(page.get_by_text("Answer").first).to_be_visible()
+    running.process.send_signal(signal.SIGINT)
+    running.finish()
 
 
 def children(pid: int, command: str) -> list[int]:

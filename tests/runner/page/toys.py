@@ -113,8 +113,8 @@ class LampStory:
                     *("a", "A lamp", "It blinks.", self._photo, (s.Action("lamp", "blink", "Dizzy", {"times": "10"}),)),
                     more=(s.Action("lamp", "switch", "Label", {}, s.Ask("note", "What to write on it")),),
                     lines=(
-                        s.Line("It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),
-                        s.Line("It is red.", (s.Action("lamp", "switch", "Paint", {}, colour),)),
+                        s.Line("shade", "It has a shade.", (s.Action("lamp", "switch", "Take off", {"note": "bare"}),)),
+                        s.Line("colour", "It is red.", (s.Action("lamp", "switch", "Paint", {}, colour),)),
                     ),
                     lines_title="Its parts",
                     file=s.File("f", "lamp.txt", "Export", np.frombuffer(b"a lamp", np.uint8)),

@@ -10,7 +10,9 @@ from stages.story.words import words_of
 SAID = {
     "stopped, as asked": "angehalten, wie gewünscht",
     "stopped, as asked; in the hand: tea_box": "angehalten, wie gewünscht; in der Hand ist noch die Teeschachtel",
-    "interactive-20261122-205043: no answer to 'call' within 10 s": "das Programm des Roboters antwortet nicht",
+    "interactive-20261122-205043: no answer to 'call' within 10 s": (
+        "das Programm des Roboters antwortet nicht; ob das bei ihm angekommen ist, weiß niemand"
+    ),
     "question=1: nothing is asked now": "diese Frage ist schon beantwortet",
     "busy: waits for the person's arrangement; ask again after the verdict": (
         "der Roboter ist beschäftigt; warten Sie, bis er fertig ist, oder halten Sie ihn an"
@@ -39,6 +41,10 @@ SAID = {
         "losgelassen, ohne den Stand zu spüren, und seitdem nicht gesehen: die Tasse, nach 3-mal Hinsehen"
     ),
     "name='tea': names no object; teach it again, or restore another one": "in der Szene „tea“ ist nichts",
+    "file: is no goal: it names no object": "in der Szene dieser Datei ist nichts",
+    "what='tea_box': is the only object of the goal; delete the goal instead": (
+        "es ist das einzige Ding, das noch darin ist; löschen Sie stattdessen die Szene"
+    ),
     "unknown: nothing was felt below cup where it was let go of": (
         "unter der Tasse war beim Loslassen nichts zu spüren"
     ),

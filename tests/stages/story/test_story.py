@@ -30,6 +30,7 @@ from stages.messages import (
     ObjectPose,
     Pause,
     Question,
+    Recover,
     Restore,
     SceneEstimate,
     SceneGraph,
@@ -45,12 +46,14 @@ from stages.messages.task import STOPPED
 from stages.scene.catalogue import BUILT_IN, Catalogue
 from stages.scene.goals import GoalFolder, unpacked, without
 from stages.story import Story, words
+from stages.story.story import STEP_SECONDS
 from stages.story.words import words_of
 from tests.stages.episodes import K, outcome, plan, scene, transfer, translation
 
 CONFIGS: dict[str, dict[str, Any]] = {"demonstrator": {"catalogue": BUILT_IN, "scripted": False}, "world": {}}
 GOAL = scene({"tray": "table", "cup": "tray", "tea_box": "table"}, beside={"tea_box": "tray"})
 START = scene({"tray": "table", "cup": "table", "tea_box": "table"})
+NOTHING = msgspec.structs.replace(GOAL, objects=(), virtual_objects=(), assertions=())
 STEP = transfer("cup", "table", "tray")
 T_CAMERA_CUP = np.array([[1.0, 0, 0, 0], [0, -0.6, -0.8, 0], [0, 0.8, -0.6, 0.8], [0, 0, 0, 1]])
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -70,6 +73,15 @@ class Listener:
             id = f"stage.port#{self._heard}"
             self.story.hear(Heard(message, id, causes, 1_000_000_000 * self._heard))
         return f"stage.port#{self._heard}"
+
+    def idle(self, seconds: int) -> None:
+        """Nothing is heard meanwhile."""
+        self._heard += seconds
+
+    @property
+    def now(self) -> int:
+        """Seconds, at which something was heard last."""
+        return self._heard
 
     def called(self, command: Teach | Restore | Look) -> None:
         """A command, and the look that follows it."""
@@ -262,11 +274,29 @@ def test_the_map_shows_what_can_be_moved_and_where_it_was_put() -> None:
     assert listener.told().map is None
 
 
+def test_where_nothing_is_seen_there_is_no_map_and_all_else_is_told() -> None:
+    listener = Listener()
+    listener.called(Look())
+    listener.seen(msgspec.structs.replace(NOTHING, support=None))
+    assert (listener.told().map, listener.offered()["teach"]) == (None, True)
+
+
 def test_every_disturbance_is_another() -> None:
     listener = Listener()
     listener.hear(Arrange(kind="start"), Arrange(kind="goal"), Arrange(kind="start"))
     disturb = next(one for one in listener.told().actions if one.arguments.get("kind") == "start")
     assert disturb.arguments == {"kind": "start", "draw": "2"}
+
+
+def test_a_goal_that_cannot_be_shown_says_so_and_takes_nothing_else_away(tmp_path: Path) -> None:
+    listener = Listener(goals={"folder": tmp_path})
+    listener.hear(
+        Kept(goals=tuple(Goal(name=name, scene=one, pddl="") for name, one in (("nil", NOTHING), ("tea", GOAL))))
+    )
+    broken, whole = listener.told().cards
+    assert broken.text.startswith("This scene cannot be shown: ")
+    assert ([one.command for one in broken.more], broken.actions) == (["rename", "forget"], ())
+    assert whole.actions and listener.offered()["stop"]
 
 
 # ------------------------------------------------------------------------------------------ what goes on
@@ -461,6 +491,45 @@ def test_a_plan_is_shown_before_go_and_a_pause_holds_the_next() -> None:
     listener.seen(START)
     listener.hear(plan(transfer("tea_box", "table", "table")))
     assert listener.doing == "Waits for your go; left to move: 1, about 1 min" and listener.offered()["go"]
+
+
+@pytest.mark.parametrize("command", [Restore(name="tea", ask=True), Teach(name="lunch", ask=True)])
+def test_after_a_stop_the_next_job_is_told_from_the_way_home_on(command: Restore | Teach) -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea"))
+    listener.hear(Stop(now=True), verdict(STOPPED, "stopped, as asked"))
+    listener.hear(Recover(), causes=(listener.hear(command),))
+    assert (listener.told().notice, listener.offered()["teach"]) == (None, False)
+    home = listener.hear(outcome(0, STEP))
+    listener.hear(LookRequest(purpose="look"), causes=(home,))
+    listener.seen(START)
+    listener.hear(Question(number=1, doubt=Doubt(kind="stance", object="cup")))
+    assert listener.told().question is not None
+    if isinstance(command, Restore):
+        listener.hear(Answer(question=1, choice="yes"), Task(goal_name="tea", goal=GOAL, current=START), plan(STEP))
+        assert listener.doing.startswith("Waits for your go") and listener.offered()["go"]
+        listener.hear(Go(), TransferRequest(transfer=STEP, scene=START, number=1))
+        assert listener.doing == "Puts the cup into the tray"
+
+
+def test_an_arm_that_does_not_come_home_is_no_transfer_that_failed() -> None:
+    listener = Listener()
+    listener.hear(Recover(), causes=(listener.hear(Restore(name="tea")),))
+    listener.hear(outcome(0, STEP, failed_stage="place", reason="no free way back"), verdict("executor", "no"))
+    assert (listener.notice.good, listener.notice.tried) == (False, ())
+
+
+def test_what_a_person_takes_is_not_expected_of_the_robot() -> None:
+    listener = Listener()
+    listener.taught()
+    listener.called(Restore(name="tea", ask=True))
+    listener.hear(plan(STEP, STEP, STEP), Go(), TransferRequest(transfer=STEP, scene=START, number=1))
+    listener.hear(Pause(), outcome(1, STEP), LookRequest(purpose="after transfer 1"), plan(STEP, STEP))
+    listener.idle(600)
+    listener.hear(Go(), TransferRequest(transfer=STEP, scene=START, number=2))
+    doing = listener.told().doing
+    assert doing.since_ns * 1e-9 + doing.expected_s - listener.now == 2 * STEP_SECONDS
 
 
 def test_what_is_hidden_and_still_to_be_moved_has_no_arrow() -> None:
