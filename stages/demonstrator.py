@@ -591,6 +591,11 @@ class Demonstrator(Stage):
         return self._state.repeats < self._config.repeats
 
     def _remember(self, scene: SceneGraph, ctx: Context) -> Iterator[Goal | Arrangement]:
+        """What one look took to be there, in doubt, and those after it did not show is no part of the goal."""
+        there = [
+            item for item in scene.objects if item.name not in self._state.remembered or not is_below(item, UNSURE)
+        ]
+        scene = scene if len(there) == len(scene.objects) else self._memory.related(scene, there)
         name, goals = self._state.goal_name, {**self._state.goals, self._state.goal_name: scene}
         unsure = [
             f"{item.name} ({100 * (item.probability or 0):.0f} %)" for item in scene.objects if is_below(item, SURE)

@@ -184,6 +184,25 @@ def test_what_nobody_recognised_on_what_the_goal_wants_clear_is_no_success() -> 
     assert the_verdict(episode.seen(goal)).success
 
 
+@pytest.mark.parametrize(("probability", "stays"), [(0.02, False), (0.7, True)])
+def test_what_one_look_at_a_goal_took_to_be_there_in_doubt_and_no_other_showed_is_no_part_of_it(
+    probability: float, stays: bool
+) -> None:
+    laid = with_shaker(HIDDEN)
+    both = laid.graph()
+    doubted = tuple(
+        msgspec.structs.replace(one, probability=probability if one.name == "salt_shaker" else 1.0)
+        for one in both.objects
+    )
+    episode = Episode(scripted=False, repeats=1)
+    episode.called(Teach(name="tea"))
+    episode.seen(msgspec.structs.replace(both, objects=doubted), view(laid))
+    (goal,) = episode.seen(CARTON.graph(), view(laid))
+    assert isinstance(goal, Goal)
+    assert ("salt_shaker" in {item.name for item in goal.scene.objects}) == stays
+    assert any("salt_shaker" in item.arguments for item in goal.scene.assertions) == stays
+
+
 def test_what_nobody_recognised_in_the_goal_must_be_there_again() -> None:
     """Of a bowl under a mug a ring shows; a mug by itself is not that goal, though nobody can say what it lacks."""
 

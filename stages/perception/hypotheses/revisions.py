@@ -151,15 +151,17 @@ def new_offers(suggestions: Sequence[Offer], offers: Sequence[Offer]) -> list[Of
     return [each for each in suggestions if not any(_same(each, offer) for offer in offers)]
 
 
-def some_of_each_box(revisions: Sequence[Revision], offers: Sequence[Offer], most: int) -> list[Revision]:
-    """The first few revisions of those that bring in one offer each, by its box: no box keeps others from a trial."""
-    tried = Counter[tuple[float, ...]]()
-    found: list[Revision] = []
-    for revision in revisions:
-        box = tuple(offers[revision.new[0]].candidate.box.tolist())
+def some_of_each_box(
+    revisions: Sequence[Revision], offers: Sequence[Offer], most: int, *, boxes: int
+) -> list[Revision]:
+    """Of revisions that bring in one offer each, the first ``most`` of the first one's box, then those of the other
+    boxes in turns, ``boxes`` times as many in all: no box keeps the others from a trial."""
+    boxes_of = [tuple(offers[each.new[0]].candidate.box.tolist()) for each in revisions]
+    tried, turns = Counter[tuple[float, ...]](), list[tuple[int, int]]()
+    for k, box in enumerate(boxes_of):
+        turns += [(-1 if box == boxes_of[0] else tried[box], k)] if tried[box] < most else []
         tried[box] += 1
-        found += [revision] if tried[box] <= most else []
-    return found
+    return [revisions[k] for _, k in sorted(turns)[: boxes * most]]
 
 
 def is_better(log_weight: float, known: float) -> bool:

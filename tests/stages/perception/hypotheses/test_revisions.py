@@ -99,6 +99,9 @@ def test_what_hangs_is_carried_by_something_though_a_box_below_it_leaves_somethi
 
 
 def test_no_box_keeps_others_from_a_trial():
-    offers = offered(*((label, box, True) for box in (LEFT, RIGHT) for label in ("cup", "mug", "sponge")))
-    revisions = [Revision((), (k,)) for k in range(6)]
-    assert [one.new for one in some_of_each_box(revisions, offers, 2)] == [(0,), (1,), (3,), (4,)]
+    boxes = (LEFT, RIGHT, RIGHT + 200)
+    offers = offered(*((label, box, True) for box in boxes for label in ("cup", "mug", "sponge")))
+    revisions = [Revision((), (k,)) for k in range(9)]
+    assert [one.new[0] for one in some_of_each_box(revisions, offers, 2, boxes=3)] == [0, 1, 3, 6, 4, 7]
+    assert [one.new[0] for one in some_of_each_box(revisions, offers, 2, boxes=2)] == [0, 1, 3, 6]
+    assert some_of_each_box([], offers, 2, boxes=2) == []
