@@ -422,8 +422,10 @@ class Targets:
         return regions.inside(item.outline, scene.surface, margin=self._workspace.edge)
 
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
-        """Places on the table, near, well within reach, with space around, where nothing of the goal will stand."""
-        item = scene.standing[step.item]
+        """Places on the table, near, well within reach, with space around, where nothing of the goal will stand; what
+        leans rests on one of its sides there."""
+        leans = not scene.standing[step.item].stance.aligned
+        item = self._placements.settled(scene.standing[step.item])
         others = scene.others(step.item, TABLE)
         reserved = [
             next((place for place in places if self._supported(place, TABLE, scene, None)), places[0])
@@ -442,7 +444,7 @@ class Targets:
             far = self._robot.beyond_reach(scene.T_base_table @ spot.T_table_object)
             spots.append(Placement(spot, 0.2 * distance + 2 * (crowded + far) + _hidden(spot, others, scene)))
         spots = sorted(spots, key=lambda placement: placement.cost)[: 2 * self._workspace.targets]
-        if step.item in self._turned:
+        if leans or step.item in self._turned:
             spots += self._on_other_sides(item, spots, others, scene)
         return spots, ()
 

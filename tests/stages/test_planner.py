@@ -14,7 +14,7 @@ from runner.contract import Refused
 from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, raised
 from stages.messages import Plan, Task
 from stages.messages.scene import Side, UnknownRegion
 from stages.planner import Planner
@@ -756,6 +756,21 @@ def test_what_leans_as_it_was_shown_or_has_to_carry_nothing_stays(shown: bool):
     if shown:
         goal.poses["bowl"] = start.poses["bowl"]
     assert [transfer.object for transfer in plan(goal, start).transfers] == ["cup"]
+
+
+@pytest.mark.parametrize("name", ["salt_shaker", "soup_can", "sauce_bottle"])
+def test_what_leans_is_put_aside_standing_on_the_table_clear_of_what_it_leans_on(name: str):
+    goal = Layout().put("sponge", 0.0, 0.1).put("tuna_can", 0.05, -0.2)
+    start = Layout(dict(goal.poses)).put(name, 0.0, 0.0, on="sponge")
+    start.poses[name] = raised(leaning(name, start.poses[name], 20), catalogue()["sponge"].dimensions[2])
+    found = plan(goal, start)
+    assert [transfer.key for transfer in found.transfers] == [f"{name}: sponge -> table"], found.reason
+    for which in range(len(found.transfers[0].T_base_targets)):
+        after = executed(start, found, which=which)
+        T = after.poses[name]
+        assert (catalogue()[name].mesh.vertices @ T[2, :3]).min() + T[2, 3] == pytest.approx(0.0, abs=1e-6)
+        assert Standing.at(name, stances(name), T).stance.aligned
+        assert penetrations(after) == [] and reached(goal, after)
 
 
 def leaning(name: str, T_table_object: Floats, degrees: float) -> Floats:
