@@ -197,6 +197,7 @@ class Targets:
         already may crowd others. ``what`` is said of how far it is.
         """
         self._what, self._steps = what, len(steps)
+        scene = self._on_its_table(scene)
         found = self._chosen(steps, scene, again, late)
         return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]
 
@@ -205,6 +206,7 @@ class Targets:
     ) -> Next | Blocked | Crowded:
         """One step's targets and the scene after it, whatever becomes of the ``rest``."""
         self._tell(f"one transfer after the other: {len({one.item for one in (step, *rest)})} objects to move", step)
+        scene = self._on_its_table(scene)
         options = self._options(step, rest, scene, again)
         if isinstance(options, Blocked):
             return options
@@ -216,6 +218,14 @@ class Targets:
             return Crowded(step)
         targets = self._targets(_alike_from(number, options.places[: number + self._workspace.targets]), scene)
         return Next(targets, scene.after(step.item, chosen, step.destination))
+
+    def _on_its_table(self, scene: Scene) -> Scene:
+        """A scene whose table was not seen has the one that the robot is said to stand at."""
+        if scene.surface is not None:
+            return scene
+        middle, half = np.array(self._robot.table.center), np.array(self._robot.table.size) / 2
+        declared = regions.rectangle(middle - half, middle + half)
+        return replace(scene, surface=regions.moved(declared, inverse(scene.T_base_table)))
 
     def _tell(self, how_far: str, step: Step) -> None:
         """Now and then, by what was looked at and not by the clock: a plan that is made again says the same."""
@@ -413,8 +423,7 @@ class Targets:
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
-        if scene.surface is None:
-            return True
+        assert scene.surface is not None
         inward, offset = scene.surface_edges
         # The circle around the outline mostly tells, much faster.
         if float((inward @ item.T_table_stance[:2, 3] - offset).min()) > self._workspace.edge + item.stance.radius:

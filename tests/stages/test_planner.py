@@ -332,7 +332,11 @@ def test_a_stranger_in_the_place_of_a_child_is_moved():
     assert reached(goal, executed(start, found))
 
 
+WIDE = regions.rectangle([-0.35, -0.6], [0.55, 0.6])
+
+
 def shelf() -> Layout:
+    """On a wide table."""
     return Layout().put("tray", 0.1, 0.3).put("sugar_box", -0.16, -0.1)
 
 
@@ -343,14 +347,17 @@ def crowded_goal() -> Layout:
 
 def test_nothing_is_placed_beside_what_is_still_to_be_picked():
     start = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.05, -0.35)
-    assert [transfer.object for transfer in plan(crowded_goal(), start).transfers] == ["tea_box", "water_bottle"]
+    assert [transfer.object for transfer in plan(crowded_goal(), start, surface=WIDE).transfers] == [
+        "tea_box",
+        "water_bottle",
+    ]
 
 
 def test_a_neighbour_that_keeps_the_hand_away_is_moved_first():
     """The bottle is where it belongs, and so near that no grasp of the tea box has room; it belongs as well on the
     other side of the sugar box."""
     stuck = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", -0.08, -0.1)
-    found = plan(crowded_goal(), stuck)
+    found = plan(crowded_goal(), stuck, surface=WIDE)
     assert [transfer.object for transfer in found.transfers] == ["water_bottle", "tea_box"]
     assert reached(crowded_goal(), executed(stuck, found))
 
@@ -385,8 +392,11 @@ def test_what_leans_over_an_object_is_moved_before_that_is_lifted():
 
 def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
-    assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]
-    found = plan(crowded_goal(), near, avoid=("tea_box: table -> tray",))
+    assert [transfer.object for transfer in plan(crowded_goal(), near, surface=WIDE).transfers] == [
+        "tea_box",
+        "water_bottle",
+    ]
+    found = plan(crowded_goal(), near, surface=WIDE, avoid=("tea_box: table -> tray",))
     again = [transfer.key for transfer in found.transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
     moved = next(transfer for transfer in found.transfers if transfer.key == "water_bottle: table -> table")
@@ -402,7 +412,7 @@ def test_what_failed_and_is_gone_is_no_reason_not_to_plan():
 
 def test_a_transfer_that_failed_in_other_places_too_is_made_by_way_of_a_place_aside():
     start, key = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.05, -0.35), "tea_box: table -> tray"
-    found = plan(crowded_goal(), start, avoid=(key, key))
+    found = plan(crowded_goal(), start, surface=WIDE, avoid=(key, key))
     moves = [transfer.key for transfer in found.transfers if transfer.object == "tea_box"]
     assert moves == ["tea_box: table -> table", key]
     assert reached(crowded_goal(), executed(start, found))
@@ -468,9 +478,12 @@ def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere(
 def test_a_plan_whose_next_transfer_failed_is_not_gone_on_with():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
     then = tuple(
-        action for transfer in plan(crowded_goal(), near).transfers for action in (transfer.pick, transfer.place)
+        action
+        for transfer in plan(crowded_goal(), near, surface=WIDE).transfers
+        for action in (transfer.pick, transfer.place)
     )
-    task = Task(goal_name="goal", goal=crowded_goal().graph(), current=near.graph(), then=then)
+    current = msgspec.structs.replace(near.graph(), support=WIDE)
+    task = Task(goal_name="goal", goal=crowded_goal().graph(), current=current, then=then)
     failed = msgspec.structs.replace(task, avoid=("tea_box: table -> tray",))
     first = [planner().on_task(each, Recorded()).transfers[0].object for each in (task, failed)]
     assert first == ["tea_box", "water_bottle"]
@@ -634,6 +647,14 @@ def test_a_place_beyond_the_tables_edge_beside_what_nobody_can_move_is_refused_a
     found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=start), context)
     assert found.reason == "no room on the table for tuna_can within reach"
     assert not any("plans one transfer after the other" in line for line in context.lines)
+
+
+def test_a_table_that_was_not_seen_ends_where_the_robot_has_it():
+    goal = Layout().put("sponge", -0.1, -0.24)
+    found = plan(goal, Layout(dict(goal.poses)).put("bowl", 0.0, 0.0, on="sponge"))
+    middle, half = np.array(ROBOT.table.center) - T_BASE_TABLE[:2, 3], np.array(ROBOT.table.size) / 2
+    assert [transfer.key for transfer in found.transfers] == ["bowl: sponge -> table"]
+    assert over_the_edge(found, regions.rectangle(middle - half, middle + half)) == []
 
 
 def test_what_belongs_near_the_edge_is_turned_along_it_where_no_quarter_turn_fits():
