@@ -493,6 +493,8 @@ def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:
     blocked = options.blocked
     if failed is None:
         why, obstacles = options.handled.why_not()
+        if not options.handled.is_picked:
+            return Blocked(step, obstacles, why)
         return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why)
     if not failed.obstacles and blocked.obstacles:
         return blocked

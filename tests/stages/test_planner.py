@@ -511,9 +511,17 @@ def test_what_the_hand_cannot_reach_is_refused_with_object_and_reason():
     goal = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box")
     found = plan(goal, Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0.6, 0.4))
     assert (found.status, found.transfers) == ("refused", ())
-    assert found.reason == (
-        "soup_can cannot be taken from table to tea_box: no grasp of it is reachable without a collision"
-    )
+    assert found.reason == "soup_can cannot be taken from table to tea_box: it is out of reach"
+
+
+def test_what_takes_up_the_place_of_what_no_hand_reaches_is_not_blamed():
+    tray = Layout().put("tray", 0.1, -0.25, yaw=np.pi / 2)
+    goal = Layout(dict(tray.poses)).put("cup", -0.05, 0.0, on="tray")
+    start = Layout(dict(tray.poses)).put("cup", 0.52, 0.3).put("sugar_box", -0.05, 0.0, on="tray")
+    context = Recorded()
+    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()), context)
+    assert found.reason == "cup cannot be taken from table to tray: it is out of reach"
+    assert not any("sugar_box" in line for line in context.lines)
 
 
 def test_a_transfer_that_failed_gets_other_targets():
