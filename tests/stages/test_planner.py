@@ -21,6 +21,7 @@ from stages.planner import Planner
 from stages.planning.handling import Handling
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
+from stages.planning.stepwise import stepwise
 from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Step
 from stages.planning.targets import Crowded, Next, Targets, Workspace, neighbours
@@ -985,6 +986,17 @@ def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other()
     assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
     assert penetrations(executed(FULL_TRAY, found)) == []
     assert len(found.transfers) <= 10
+
+
+def test_one_transfer_after_the_other_also_leads_to_goals_that_do_not_say_where_a_carrier_is():
+    text = "(define (problem p) (:domain scene) (:objects bowl cup - item) (:init) (:goal (in cup bowl)))"
+    known = {name: stances(name) for name in ("bowl", "cup")}
+    start, goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, -0.2).graph(), scene_of(text, catalogue())
+    problem = Problem.between(start, goal, held=frozenset(), graspable=frozenset(known))
+    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
+    targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, dict(problem.goal))
+    steps = stepwise(problem, targets, Scene.of(start, known), np.random.default_rng(0))
+    assert [step.key for step, _ in steps or ()] == ["cup: table -> bowl"]
 
 
 def test_what_was_put_where_a_later_object_lacks_the_room_is_put_elsewhere():
