@@ -52,7 +52,7 @@ FOLLOWED = 6
 BEYOND = 1.0
 """Cost of a place outside the area in which the robot places: the hand may get there, as it does not everywhere."""
 ALIKE = 0.015
-"""Metres within which two places at which an object is turned alike are as good as one: the arm reaches both or none."""
+"""Metres within which two places of an object that is turned alike are as good as one: the arm reaches both or none."""
 SPREAD = 0.5
 """The same for what may be anywhere on the table, as a share of how far it is from where it was shown: so that a few
 places reach far."""
@@ -222,7 +222,7 @@ class Targets:
         if scene.surface is not None:
             return scene
         middle, half = np.array(self._robot.table.center), np.array(self._robot.table.size) / 2
-        declared = regions.rectangle(middle - half, middle + half)
+        declared = regions.rectangle((middle - half).tolist(), (middle + half).tolist())
         return replace(scene, surface=regions.moved(declared, inverse(scene.T_base_table)))
 
     def _tell(self, how_far: str, step: Step) -> None:

@@ -177,8 +177,8 @@ class Moves:
         return item in self._problem.goal and self._stays(item, state)
 
     def _stays(self, item: str, state: State) -> bool:
-        """Whether neither an item, which may be anywhere where the goal does not say what carries it, nor anything below
-        or beside it will have to move."""
+        """Whether neither an item nor anything below or beside it will have to move. It may be anywhere where the goal
+        does not say what carries it."""
         if item == TABLE:
             return True
         supports, held, obstructions, turned = state
