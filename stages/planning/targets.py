@@ -14,7 +14,7 @@ from runner.contract import Refused
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
-from stages.planning.places.placements import ROLLED, Placement, Placements, Scene, turned_alike
+from stages.planning.places.placements import Placement, Placements, Scene
 from stages.planning.places.sight import hidden_share
 from stages.planning.symbolic.problem import TABLE
 from stages.planning.symbolic.search import Step
@@ -51,8 +51,9 @@ FOLLOWED = 6
 
 BEYOND = 1.0
 """Cost of a place outside the area in which the robot places: the hand may get there, as it does not everywhere."""
-ALIKE = 0.015
-"""Metres within which two places of an object that is turned alike are as good as one: the arm reaches both or none."""
+ALIKE = (0.015, 1 + 2 * float(np.cos(np.deg2rad(30))))
+"""Shift in metres, and trace of the rotation between them, within which two poses are as good as one: the arm reaches
+both or none."""
 SPREAD = 0.5
 """The same for what may be anywhere on the table, as a share of how far it is from where it was shown: so that a few
 places reach far."""
@@ -370,14 +371,13 @@ class Targets:
     ) -> Found:
         """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
         others = scene.others(step.item, step.destination)
-        symmetries = scene.standing[step.item].stance.item.symmetries.transforms(ROLLED)
         valid: list[Placement] = []
         beyond: list[Placement] = []
         blocking: list[tuple[str, ...]] = []
         anywhere, considered = step.destination == TABLE and not step.region, 0
         for placement in placements:
-            apart = max(ALIKE, SPREAD * placement.cost) if anywhere else ALIKE
-            if any(_alike(placement.standing, other.standing, apart, symmetries) for other in (*valid, *beyond)):
+            apart = max(ALIKE[0], SPREAD * placement.cost) if anywhere else ALIKE[0]
+            if any(_alike(placement.standing, other.standing, apart) for other in (*valid, *beyond)):
                 continue
             if not self._supported(placement.standing, step.destination, scene, margin):
                 continue
@@ -512,9 +512,11 @@ def neighbours(name: str, scene: Scene) -> list[str]:
     return sorted((other for other in gaps if gaps[other] < CROWDED), key=lambda other: gaps[other])
 
 
-def _alike(a: Standing, b: Standing, metres: float, symmetries: Floats) -> bool:
-    """Whether two poses of an object with such symmetries (S x 4 x 4) differ so little that one of them is enough."""
-    return _distance(a, b) < metres and turned_alike(a.T_table_object, b.T_table_object, symmetries)
+def _alike(a: Standing, b: Standing, metres: float) -> bool:
+    """Whether two poses of an object differ so little that one of them is enough."""
+    if _distance(a, b) >= metres:
+        return False
+    return bool(a.T_table_object[:3, :3].ravel() @ b.T_table_object[:3, :3].ravel() > ALIKE[1])
 
 
 def _effort(obstacles: tuple[str, ...], scene: Scene) -> tuple[int, int]:

@@ -30,10 +30,6 @@ _HANGS = 0.012
 """Metres above what carries it from which on something must be under an object."""
 _LEANS = np.deg2rad(3)
 """Tilt from which on an object leans: an estimate is off by less, radians."""
-ROLLED = np.pi / 8
-"""Steps in which continuous symmetries are looked at."""
-_ALIKE = 1 + 2 * float(np.cos(np.deg2rad(30)))
-"""Trace of the rotation between two poses that are turned alike."""
 _ANYWHERE = 1.0
 """Metres from where it was shown within which an object may stand that only has to be on the table."""
 
@@ -166,8 +162,7 @@ class Placements:
         if item.name not in self._sides:
             ways = _any_side(T, item)
             between = yawed(np.pi / QUARTERS, np.zeros(3))[:3, :3]
-            ways += [(_turned(way, between), _ASKEW + cost) for way, cost in ways if askew]
-            return _distinct(ways, item.stance.item.symmetries.transforms(ROLLED))
+            return ways + [(_turned(way, between), _ASKEW + cost) for way, cost in ways if askew]
         faced = inverse(scene.T_base_table) @ turned_to(self._poses[item.name], self._sides[item.name])
         faced[:3, 3] = T[:3, 3]
         return [(faced, 0.0)]
@@ -218,7 +213,7 @@ class Placements:
         else:
             support = scene.standing[step.destination]
             relative = inverse(self._goal.standing[step.destination].T_table_object) @ self._shown(step.item)
-            poses = support.T_table_object @ support.stance.item.symmetries.transforms(ROLLED) @ relative
+            poses = support.T_table_object @ support.stance.item.symmetries.transforms(np.pi / 8) @ relative
         shown = self._shown(step.item)
         upright = poses[:, 2, :3] @ shown[2, :3] > np.cos(ALIGNED)
         if step.region and not upright.any():
@@ -289,21 +284,6 @@ def _any_side(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
     found = [(turned, 0.002 * k) for k, turned in enumerate(kept or [T])]
     quarters = (yawed(2 * np.pi * k / QUARTERS, np.zeros(3))[:3, :3] for k in range(1, QUARTERS))
     return found + [(_turned(found[0][0], R), TURNED + 0.002 * k) for k, R in enumerate(quarters)]
-
-
-def _distinct(ways: Sequence[tuple[Floats, float]], symmetries: Floats) -> list[tuple[Floats, float]]:
-    """Ways to turn an object, each with its cost, without those that are nearly as an earlier one."""
-    kept: list[tuple[Floats, float]] = []
-    for way, cost in ways:
-        if not any(turned_alike(way, other, symmetries) for other, _ in kept):
-            kept.append((way, cost))
-    return kept
-
-
-def turned_alike(A: Floats, B: Floats, symmetries: Floats) -> bool:
-    """Whether an object with such symmetries (S x 4 x 4) is turned nearly alike in two poses (4 x 4)."""
-    turn = B[:3, :3].T @ A[:3, :3]
-    return bool((symmetries[:, :3, :3] * turn).sum((1, 2)).max() > _ALIKE)
 
 
 def _turned(T: Floats, R: Floats) -> Floats:

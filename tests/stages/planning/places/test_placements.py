@@ -5,7 +5,6 @@ from scipy.spatial.transform import Rotation
 
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.symbolic.problem import TABLE
-from stages.planning.symbolic.search import Step
 from stages.scene.stance import Standing
 from tests.stages.layouts import Layout, stances
 
@@ -35,16 +34,3 @@ def test_what_leans_is_set_down_on_the_side_that_it_is_nearest_to(degrees: float
     settled = placements.settled(tilted("soup_can", degrees))
     assert settled.stance.aligned
     assert settled.T_table_object[:, 2:] == pytest.approx(tilted("soup_can", lies).T_table_object[:, 2:], abs=1e-6)
-
-
-@pytest.mark.parametrize(("name", "ways"), [("soup_can", 1), ("salt_shaker", 1), ("tea_box", 2), ("mug", 4)])
-def test_an_object_is_turned_only_in_ways_that_differ(name: str, ways: int) -> None:
-    layout, known = (
-        Layout().put("sponge", 0.0, 0.0).put(name, 0.0, 0.2),
-        {one: stances(one) for one in (name, "sponge")},
-    )
-    scene = Scene.of(layout.graph(), known)
-    step = Step(name, TABLE, TABLE)
-    placements = Placements(layout.graph(), known, layout.graph()).of(step, scene)
-    places = [tuple(one.standing.T_table_stance[:2, 3].round(6)) for one in placements]
-    assert places.count((0.0, 0.2)) == ways
