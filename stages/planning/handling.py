@@ -62,6 +62,11 @@ class Handled:
             self._reached[number] = self._planner.reaches(number, self._robot.home)
         return self._reached[number]
 
+    @property
+    def is_picked(self) -> bool:
+        """Whether the hand takes the object, wherever it then gets with it."""
+        return self._planner.is_picked
+
     def why_not(self) -> tuple[str, tuple[str, ...]]:
         """Why no place is reached: in words, and the objects in the way."""
         return self._planner.obstacle[1], self._planner.in_the_way(self._robot.home)

@@ -41,8 +41,8 @@ FARTHER = 0.07
 """Metres beyond the robot's reach within which something may be placed if the hand gets there."""
 FEWEST = 4
 """Poses offered for a transfer of which only late ones are within reach."""
-BRANCHES, TRIES = 4, 80
-"""Places of one step from which is gone on, and how many in all before each step has but one."""
+BRANCHES, TRIES = 4, 20
+"""Places of one step from which is gone on, and how many of one plan before each step has but one."""
 
 TOLD = 10
 """Steps that are looked at before it is said again how far the plan is."""
@@ -177,10 +177,9 @@ class Targets:
         self._turned = turned
         self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
-        self._tries = TRIES
         self._log, self._looked = log, count(1)
-        self._what, self._steps = "", 0
-        """Which plan it is, and its length."""
+        self._what, self._steps, self._tries = "", 0, 0
+        """Which plan it is, its length, and how many more places of its steps are tried."""
 
     def of(
         self,
@@ -196,7 +195,8 @@ class Targets:
         Steps ``again`` failed before with the best poses and get those that come next. Items that are ``late``
         already may crowd others. ``what`` is said of how far it is.
         """
-        self._what, self._steps = what, len(steps)
+        self._what, self._steps, self._tries = what, len(steps), TRIES
+        scene = self._on_its_table(scene)
         found = self._chosen(steps, scene, again, late)
         return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]
 
@@ -205,6 +205,7 @@ class Targets:
     ) -> Next | Blocked | Crowded:
         """One step's targets and the scene after it, whatever becomes of the ``rest``."""
         self._tell(f"one transfer after the other: {len({one.item for one in (step, *rest)})} objects to move", step)
+        scene = self._on_its_table(scene)
         options = self._options(step, rest, scene, again)
         if isinstance(options, Blocked):
             return options
@@ -216,6 +217,14 @@ class Targets:
             return Crowded(step)
         targets = self._targets(_alike_from(number, options.places[: number + self._workspace.targets]), scene)
         return Next(targets, scene.after(step.item, chosen, step.destination))
+
+    def _on_its_table(self, scene: Scene) -> Scene:
+        """A scene whose table was not seen has the one that the robot is said to stand at."""
+        if scene.surface is not None:
+            return scene
+        middle, half = np.array(self._robot.table.center), np.array(self._robot.table.size) / 2
+        declared = regions.rectangle((middle - half).tolist(), (middle + half).tolist())
+        return replace(scene, surface=regions.moved(declared, inverse(scene.T_base_table)))
 
     def _tell(self, how_far: str, step: Step) -> None:
         """Now and then, by what was looked at and not by the clock: a plan that is made again says the same."""
@@ -413,8 +422,7 @@ class Targets:
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
-        if scene.surface is None:
-            return True
+        assert scene.surface is not None
         inward, offset = scene.surface_edges
         # The circle around the outline mostly tells, much faster.
         if float((inward @ item.T_table_stance[:2, 3] - offset).min()) > self._workspace.edge + item.stance.radius:
@@ -422,8 +430,10 @@ class Targets:
         return regions.inside(item.outline, scene.surface, margin=self._workspace.edge)
 
     def _free_spots(self, step: Step, pending: Sequence[Step], scene: Scene) -> Found:
-        """Places on the table, near, well within reach, with space around, where nothing of the goal will stand."""
-        item = scene.standing[step.item]
+        """Places on the table, near, well within reach, with space around, where nothing of the goal will stand; what
+        leans rests on one of its sides there."""
+        leans = not scene.standing[step.item].stance.aligned
+        item = self._placements.settled(scene.standing[step.item])
         others = scene.others(step.item, TABLE)
         reserved = [
             next((place for place in places if self._supported(place, TABLE, scene, None)), places[0])
@@ -442,7 +452,7 @@ class Targets:
             far = self._robot.beyond_reach(scene.T_base_table @ spot.T_table_object)
             spots.append(Placement(spot, 0.2 * distance + 2 * (crowded + far) + _hidden(spot, others, scene)))
         spots = sorted(spots, key=lambda placement: placement.cost)[: 2 * self._workspace.targets]
-        if step.item in self._turned:
+        if leans or step.item in self._turned:
             spots += self._on_other_sides(item, spots, others, scene)
         return spots, ()
 
@@ -482,6 +492,8 @@ def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:
     blocked = options.blocked
     if failed is None:
         why, obstacles = options.handled.why_not()
+        if not options.handled.is_picked:
+            return Blocked(step, obstacles, why)
         return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why)
     if not failed.obstacles and blocked.obstacles:
         return blocked

@@ -14,16 +14,17 @@ from runner.contract import Refused
 from stages.devices.suites import tray
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, raised
 from stages.messages import Plan, Task
 from stages.messages.scene import Side, UnknownRegion
 from stages.planner import Planner
 from stages.planning.handling import Handling
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
+from stages.planning.stepwise import stepwise
 from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Step
-from stages.planning.targets import Crowded, Next, Targets, Workspace, neighbours
+from stages.planning.targets import BRANCHES, TRIES, Blocked, Crowded, Next, Targets, Workspace, neighbours
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
@@ -332,7 +333,11 @@ def test_a_stranger_in_the_place_of_a_child_is_moved():
     assert reached(goal, executed(start, found))
 
 
+WIDE = regions.rectangle([-0.35, -0.6], [0.55, 0.6])
+
+
 def shelf() -> Layout:
+    """On a wide table."""
     return Layout().put("tray", 0.1, 0.3).put("sugar_box", -0.16, -0.1)
 
 
@@ -343,14 +348,17 @@ def crowded_goal() -> Layout:
 
 def test_nothing_is_placed_beside_what_is_still_to_be_picked():
     start = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.05, -0.35)
-    assert [transfer.object for transfer in plan(crowded_goal(), start).transfers] == ["tea_box", "water_bottle"]
+    assert [transfer.object for transfer in plan(crowded_goal(), start, surface=WIDE).transfers] == [
+        "tea_box",
+        "water_bottle",
+    ]
 
 
 def test_a_neighbour_that_keeps_the_hand_away_is_moved_first():
     """The bottle is where it belongs, and so near that no grasp of the tea box has room; it belongs as well on the
     other side of the sugar box."""
     stuck = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", -0.08, -0.1)
-    found = plan(crowded_goal(), stuck)
+    found = plan(crowded_goal(), stuck, surface=WIDE)
     assert [transfer.object for transfer in found.transfers] == ["water_bottle", "tea_box"]
     assert reached(crowded_goal(), executed(stuck, found))
 
@@ -385,8 +393,11 @@ def test_what_leans_over_an_object_is_moved_before_that_is_lifted():
 
 def test_a_neighbour_is_moved_before_a_pick_that_failed_is_tried_again():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
-    assert [transfer.object for transfer in plan(crowded_goal(), near).transfers] == ["tea_box", "water_bottle"]
-    found = plan(crowded_goal(), near, avoid=("tea_box: table -> tray",))
+    assert [transfer.object for transfer in plan(crowded_goal(), near, surface=WIDE).transfers] == [
+        "tea_box",
+        "water_bottle",
+    ]
+    found = plan(crowded_goal(), near, surface=WIDE, avoid=("tea_box: table -> tray",))
     again = [transfer.key for transfer in found.transfers]
     assert again.index("water_bottle: table -> table") < again.index("tea_box: table -> tray")
     moved = next(transfer for transfer in found.transfers if transfer.key == "water_bottle: table -> table")
@@ -402,7 +413,7 @@ def test_what_failed_and_is_gone_is_no_reason_not_to_plan():
 
 def test_a_transfer_that_failed_in_other_places_too_is_made_by_way_of_a_place_aside():
     start, key = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.05, -0.35), "tea_box: table -> tray"
-    found = plan(crowded_goal(), start, avoid=(key, key))
+    found = plan(crowded_goal(), start, surface=WIDE, avoid=(key, key))
     moves = [transfer.key for transfer in found.transfers if transfer.object == "tea_box"]
     assert moves == ["tea_box: table -> table", key]
     assert reached(crowded_goal(), executed(start, found))
@@ -468,9 +479,12 @@ def test_what_must_come_first_leaves_the_hand_room_where_it_may_stand_elsewhere(
 def test_a_plan_whose_next_transfer_failed_is_not_gone_on_with():
     near = shelf().put("tea_box", 0.0, -0.1).put("water_bottle", 0.11, -0.1)
     then = tuple(
-        action for transfer in plan(crowded_goal(), near).transfers for action in (transfer.pick, transfer.place)
+        action
+        for transfer in plan(crowded_goal(), near, surface=WIDE).transfers
+        for action in (transfer.pick, transfer.place)
     )
-    task = Task(goal_name="goal", goal=crowded_goal().graph(), current=near.graph(), then=then)
+    current = msgspec.structs.replace(near.graph(), support=WIDE)
+    task = Task(goal_name="goal", goal=crowded_goal().graph(), current=current, then=then)
     failed = msgspec.structs.replace(task, avoid=("tea_box: table -> tray",))
     first = [planner().on_task(each, Recorded()).transfers[0].object for each in (task, failed)]
     assert first == ["tea_box", "water_bottle"]
@@ -498,9 +512,17 @@ def test_what_the_hand_cannot_reach_is_refused_with_object_and_reason():
     goal = Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0, 0, on="tea_box")
     found = plan(goal, Layout().put("tea_box", 0.0, 0.0).put("soup_can", 0.6, 0.4))
     assert (found.status, found.transfers) == ("refused", ())
-    assert found.reason == (
-        "soup_can cannot be taken from table to tea_box: no grasp of it is reachable without a collision"
-    )
+    assert found.reason == "soup_can cannot be taken from table to tea_box: it is out of reach"
+
+
+def test_what_takes_up_the_place_of_what_no_hand_reaches_is_not_blamed():
+    tray = Layout().put("tray", 0.1, -0.25, yaw=np.pi / 2)
+    goal = Layout(dict(tray.poses)).put("cup", -0.05, 0.0, on="tray")
+    start = Layout(dict(tray.poses)).put("cup", 0.52, 0.3).put("sugar_box", -0.05, 0.0, on="tray")
+    context = Recorded()
+    found = planner().on_task(Task(goal_name="goal", goal=goal.graph(), current=start.graph()), context)
+    assert found.reason == "cup cannot be taken from table to tray: it is out of reach"
+    assert not any("sugar_box" in line for line in context.lines)
 
 
 def test_a_transfer_that_failed_gets_other_targets():
@@ -644,6 +666,14 @@ def test_a_place_beyond_the_tables_edge_beside_what_nobody_can_move_is_refused_a
     assert not any("plans one transfer after the other" in line for line in context.lines)
 
 
+def test_a_table_that_was_not_seen_ends_where_the_robot_has_it():
+    goal = Layout().put("sponge", -0.1, -0.24)
+    found = plan(goal, Layout(dict(goal.poses)).put("bowl", 0.0, 0.0, on="sponge"))
+    middle, half = np.array(ROBOT.table.center) - T_BASE_TABLE[:2, 3], np.array(ROBOT.table.size) / 2
+    assert [transfer.key for transfer in found.transfers] == ["bowl: sponge -> table"]
+    assert over_the_edge(found, regions.rectangle(middle - half, middle + half)) == []
+
+
 def test_what_belongs_near_the_edge_is_turned_along_it_where_no_quarter_turn_fits():
     goal = Layout().put("tray", 0, 0).put("tea_box", 0, -0.22, yaw=0.6)
     start = Layout().put("tray", 0, 0).put("tea_box", -0.25, 0)
@@ -764,6 +794,21 @@ def test_what_leans_as_it_was_shown_or_has_to_carry_nothing_stays(shown: bool):
     if shown:
         goal.poses["bowl"] = start.poses["bowl"]
     assert [transfer.object for transfer in plan(goal, start).transfers] == ["cup"]
+
+
+@pytest.mark.parametrize("name", ["salt_shaker", "soup_can", "sauce_bottle"])
+def test_what_leans_is_put_aside_standing_on_the_table_clear_of_what_it_leans_on(name: str):
+    goal = Layout().put("sponge", 0.0, 0.1).put("tuna_can", 0.05, -0.2)
+    start = Layout(dict(goal.poses)).put(name, 0.0, 0.0, on="sponge")
+    start.poses[name] = raised(leaning(name, start.poses[name], 20), catalogue()["sponge"].dimensions[2])
+    found = plan(goal, start)
+    assert [transfer.key for transfer in found.transfers] == [f"{name}: sponge -> table"], found.reason
+    for which in range(len(found.transfers[0].T_base_targets)):
+        after = executed(start, found, which=which)
+        T = after.poses[name]
+        assert (catalogue()[name].mesh.vertices @ T[2, :3]).min() + T[2, 3] == pytest.approx(0.0, abs=1e-6)
+        assert Standing.at(name, stances(name), T).stance.aligned
+        assert penetrations(after) == [] and reached(goal, after)
 
 
 def leaning(name: str, T_table_object: Floats, degrees: float) -> Floats:
@@ -962,6 +1007,34 @@ def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other()
     assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
     assert penetrations(executed(FULL_TRAY, found)) == []
     assert len(found.transfers) <= 10
+
+
+def test_places_that_one_plan_tried_are_not_counted_against_the_next(monkeypatch: pytest.MonkeyPatch):
+    """Wherever the box goes, nobody can put the tray on it."""
+    monkeypatch.setattr("stages.planning.targets.TOLD", 1)
+    known, lines = {name: stances(name) for name in ("tea_box", "tray")}, list[str]()
+    start = Layout().put("tea_box", 0.0, 0.2).put("tray", 0.1, -0.2)
+    goal = Layout().put("tea_box", 0.0, 0.2).put("tray", 0.0, 0.0, on="tea_box").graph()
+    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
+    wanted = {"tea_box": TABLE, "tray": "tea_box"}
+    targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, wanted, log=lines.append)
+    scene, looked = Scene.of(start.graph(), known), list[int]()
+    for _ in range(TRIES):
+        lines.clear()
+        assert isinstance(targets.of((Step("tea_box", TABLE, TABLE), Step("tray", TABLE, "tea_box")), scene), Blocked)
+        looked.append(len(lines))
+    assert looked == [1 + BRANCHES] * TRIES
+
+
+def test_one_transfer_after_the_other_also_leads_to_goals_that_do_not_say_where_a_carrier_is():
+    text = "(define (problem p) (:domain scene) (:objects bowl cup - item) (:init) (:goal (in cup bowl)))"
+    known = {name: stances(name) for name in ("bowl", "cup")}
+    start, goal = Layout().put("bowl", 0.0, 0.1).put("cup", 0.0, -0.2).graph(), scene_of(text, catalogue())
+    problem = Problem.between(start, goal, held=frozenset(), graspable=frozenset(known))
+    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
+    targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, dict(problem.goal))
+    steps = stepwise(problem, targets, Scene.of(start, known), np.random.default_rng(0))
+    assert [step.key for step, _ in steps or ()] == ["cup: table -> bowl"]
 
 
 def test_what_was_put_where_a_later_object_lacks_the_room_is_put_elsewhere():

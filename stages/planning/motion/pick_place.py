@@ -113,9 +113,12 @@ class PickPlacePlanner:
     def __init__(self, world: CollisionWorld, errand: Errand, rng: np.random.Generator, *, room: float) -> None:
         """``room``: see :class:`Margins`."""
         self._world, self._errand, self._rng, self._room = world, errand, rng, room
-        self.obstacle: tuple[FailedStage, str] = ("ik", "the catalogue has no grasp for it")
         self._entry = errand.entry.without_symmetries() if errand.faces else errand.entry
         self._grasps = [one for one in distinct_grasps(self._entry) if one.width <= world.robot.gripper.widest]
+        self.obstacle: tuple[FailedStage, str] = (
+            "ik",
+            "it is out of reach" if self._grasps else "the catalogue has no grasp for it",
+        )
         self._first_picks: dict[str, Pick | None] = {}
 
     def plans(self, start: Floats) -> Iterator[PickPlace]:
@@ -149,13 +152,14 @@ class PickPlacePlanner:
 
         Empty where it is not objects that keep it from there. To be asked once :meth:`reaches` has said no.
         """
-        poses = self._errand.targets if self._is_picked else [self._errand.T_base_object]
+        poses = self._errand.targets if self.is_picked else [self._errand.T_base_object]
         hands = (hand for T in poses for grasp in self._grasps for hand in self._hands(grasp, T))
         found = (self._touched(hand, start) for hand in islice(hands, _SUSPECTED))
         return min((names for names in found if names), key=self._effort, default=())
 
     @property
-    def _is_picked(self) -> bool:
+    def is_picked(self) -> bool:
+        """Whether :meth:`reaches` has found a grasp that takes the object where it is."""
         return any(self._first_picks.values())
 
     def _effort(self, names: Sequence[str]) -> tuple[int, int]:
@@ -168,12 +172,12 @@ class PickPlacePlanner:
         world = self._world
         world.set_width(opening(world, hand.grasp, self._room))
         placing = [self.holding(hand), world.resting(self._errand.destination)]
-        before = raised(hand.T_base_hand, ABOVE) if self._is_picked else hand.T_base_prehand
+        before = raised(hand.T_base_hand, ABOVE) if self.is_picked else hand.T_base_prehand
         with ExitStack() as stack:
-            for context in placing if self._is_picked else [world.touching(world.carried)]:
+            for context in placing if self.is_picked else [world.touching(world.carried)]:
                 stack.enter_context(context)
             found = [self._near(T, start) for T in (hand.T_base_hand, before)]
-        if not self._is_picked:
+        if not self.is_picked:
             with self.holding(hand), world.resting(self._errand.source):
                 q = next(self._postures(hand.T_base_hand, start), None)
                 with world.resting(*(() if q is None else self._leaning(q))):
@@ -226,15 +230,17 @@ class PickPlacePlanner:
     def _pick(self, hand: HandPose, start: Floats) -> Pick | None:
         """The first posture before the grasp from which straight motions lead to it, and up from there."""
         world, width = self._world, opening(self._world, hand.grasp, self._room)
-        self._note("ik", "no grasp of it is reachable without a collision")
         for pregrasp in chain.from_iterable(self._postures(before, start) for before in approaches(hand)):
             world.set_width(width)
-            if not world.is_free(pregrasp):
-                continue
+            is_free = world.is_free(pregrasp)
             with world.touching(world.carried):
-                approach = straight_motion(world, pregrasp, hand.T_base_hand)
+                approach = straight_motion(world, pregrasp, hand.T_base_hand) if is_free else None
             if approach is None:
-                self._note("pick motion", "no straight approach to a grasp")
+                reached = solve_ik(world, hand.T_base_hand, seeds=iter([pregrasp]), free=False) is not None
+                if reached and is_free:
+                    self._note("pick motion", "no straight approach to a grasp")
+                elif reached:
+                    self._note("ik", "no grasp of it is reachable without a collision")
                 continue
             lift = self._lift(hand, approach[-1])
             if lift is not None:

@@ -16,7 +16,7 @@ from stages.messages.scene import SceneGraph
 from stages.planning.symbolic.problem import TABLE, carriers
 from stages.planning.symbolic.search import Step
 from stages.scene.facing import sides, turned_to
-from stages.scene.stance import ALIGNED, Stances, Standing, standing_of, turned, yawed
+from stages.scene.stance import ALIGNED, Stances, Standing, rotation_between, standing_of, turned, yawed
 from stages.scene.virtual import in_region, region_poses
 
 QUARTERS = 4
@@ -54,8 +54,8 @@ class Scene:
 
     @staticmethod
     def of(graph: SceneGraph, stances: Mapping[str, Stances]) -> Scene:
-        """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy; what hangs in
-        the air stays there, for it stands on something that was not seen."""
+        """A perceived scene. Heights follow from what carries what, exact where the estimate is noisy; what leans stays
+        as it is, and what hangs in the air, for it stands on something that was not seen."""
         standing = {item.name: item for item in standing_of(graph.objects, stances, graph.T_base_table)}
         T_table_base = inverse(graph.T_base_table)
         poses = {item.name: T_table_base @ item.T_base_object for item in graph.objects}
@@ -64,20 +64,18 @@ class Scene:
             name = next(name for name in standing if scene.supports[name] not in standing)
             item, support = standing.pop(name), scene.supports[name]
             rested = scene.rested(item, support)
-            leaning = _leaning(item, poses[name])
-            rested = replace(item if _hangs(item, rested) else rested, T_table_leaning=leaning)
+            stays = not item.stance.aligned or _hangs(item, rested)
+            rested = replace(item if stays else rested, T_table_leaning=_leaning(item, poses[name]))
             scene = scene.after(name, rested, support)
         return scene
 
     def hangs(self, name: str) -> bool:
         """Whether an object is above what is said to carry it."""
         item = self.standing[name]
-        return _hangs(item, self.rested(item, self.supports[name]))
+        return item.stance.aligned and _hangs(item, self.rested(item, self.supports[name]))
 
     def rested(self, item: Standing, support: str) -> Standing:
-        """The object at the height at which its bottom meets the surface below it; one that leans stays."""
-        if not item.stance.aligned:
-            return item
+        """The object at the height at which its bottom meets the surface below it."""
         surface = 0.0 if support == TABLE else self.standing[support].rest_height(item.bottom)
         T = item.T_table_stance.copy()
         T[2, 3] = surface - item.stance.low
@@ -176,6 +174,16 @@ class Placements:
         taught = self._taught[step.item, step.parent]
         child = scene.standing[step.parent].T_table_object
         return in_region(taught, item.T_table_object, child, item.stance.item.symmetries)
+
+    def settled(self, item: Standing) -> Standing:
+        """An object where it is; one that leans, on the side on which it rests that it is nearest to."""
+        if item.stance.aligned:
+            return item
+        alike = item.T_table_object @ item.stance.item.symmetries.transforms()
+        ways = ((T, T[:3, :3] @ R[2]) for T in alike for R in item.stance.item.resting)
+        T, up = max(ways, key=lambda way: round(float(way[1][2]), 9))
+        T[:3, :3] = rotation_between(up, np.array([0.0, 0.0, 1.0])) @ T[:3, :3]
+        return Standing.at(item.name, self._stances[item.stance.item.name], T)
 
     def resting(self, item: Standing) -> Iterator[Standing]:
         """An object where it is, on every side on which it rests, turned by quarters."""

@@ -98,6 +98,8 @@ class Moves:
         self._movable = [item for item in order if item in problem.graspable]
         self._index = {item: i for i, item in enumerate(problem.items)}
         self._roomy = problem.roomy
+        self._taken = problem.clear | (frozenset(problem.goal.values()) - problem.roomy)
+        """What can carry nothing but what the goal has there."""
 
     def reached(self, state: State) -> bool:
         """Whether the goal holds."""
@@ -172,16 +174,22 @@ class Moves:
 
     def _settled(self, item: str, state: State) -> bool:
         """Whether an item is where it belongs and nothing below or beside it will have to move."""
-        supports, held, obstructions, turned = state
+        return item in self._problem.goal and self._stays(item, state)
+
+    def _stays(self, item: str, state: State) -> bool:
+        """Whether neither an item nor anything below or beside it will have to move. It may be anywhere where the goal
+        does not say what carries it."""
         if item == TABLE:
             return True
-        if supports[self._index[item]] != self._problem.goal.get(item):
+        supports, held, obstructions, turned = state
+        goal, support = self._problem.goal, supports[self._index[item]]
+        if support != goal.get(item) and (item in goal or support in self._taken):
             return False
         if item in turned or any(entry[0] == item for entry in obstructions):
             return False
         region = self._problem.regions.get(item)
-        beside = region is None or (item in held and self._settled(region.parent, state))
-        return beside and self._settled(self._problem.goal[item], state)
+        beside = region is None or (item in held and self._stays(region.parent, state))
+        return beside and self._stays(support, state)
 
 
 def check_engine(engine: str) -> None:

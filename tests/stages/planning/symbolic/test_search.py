@@ -24,7 +24,7 @@ from stages.messages import SceneGraph, VirtualObject
 from stages.messages.scene import SceneObject
 from stages.planning.symbolic.pddl import problem_pddl
 from stages.planning.symbolic.problem import Problem, VirtualRegion
-from stages.planning.symbolic.search import Solution, actions, breadth_first, check_engine, with_engine
+from stages.planning.symbolic.search import Moves, Solution, actions, breadth_first, check_engine, with_engine
 from stages.scene.domain import DOMAIN
 
 get_environment().credits_stream = None
@@ -166,6 +166,31 @@ def test_a_region_is_lost_when_its_parent_moves():
     assert steps(breadth_first(task)) == ["box -> tray", "can -> can_near_box"]
     assert valid(task, found_actions(task))
     assert not valid(task, ["(pick box table)", "(place-in box tray)"])
+
+
+BESIDE = {"bowl": VirtualRegion("bowl_near_tray", "tray", "bowl")}
+
+
+@pytest.mark.parametrize(
+    ("more", "stays"),
+    [
+        ({}, True),
+        ({"goal": {"cup": "bowl", "tray": "table"}}, True),
+        ({"goal": {"cup": "bowl", "tray": "box"}}, False),
+        ({"goal": {"cup": "bowl", "box": "tray"}}, False),
+        ({"goal": {"cup": "bowl", "box": "tray"}, "concave": frozenset({"tray"})}, True),
+        ({"clear": frozenset({"tray"})}, False),
+        ({"turned": frozenset({"bowl"})}, False),
+        ({"obstructions": frozenset({("bowl", "box", "table")})}, False),
+        ({"regions": BESIDE}, False),
+        ({"regions": BESIDE, "held": frozenset({"bowl"})}, True),
+    ],
+)
+def test_what_may_be_anywhere_carries_what_belongs_on_it_unless_it_has_to_move(more: dict[str, object], stays: bool):
+    supports = {"tray": "table", "bowl": "tray", "cup": "table", "box": "table"}
+    task = problem(supports, **{"goal": {"cup": "bowl"}, **more})  # type: ignore[arg-type]
+    moves = Moves(task, task.items)
+    assert ("cup: table -> bowl" in {step.key for step, _ in moves.final(moves.start)}) == stays
 
 
 def test_an_obstacle_is_moved_first():
