@@ -41,8 +41,8 @@ FARTHER = 0.07
 """Metres beyond the robot's reach within which something may be placed if the hand gets there."""
 FEWEST = 4
 """Poses offered for a transfer of which only late ones are within reach."""
-BRANCHES, TRIES = 4, 20
-"""Places of one step from which is gone on, and how many of one plan before each step has but one."""
+BRANCHES, TRIES = 4, 80
+"""Places of one step from which is gone on, and how many in all before each step has but one."""
 
 TOLD = 10
 """Steps that are looked at before it is said again how far the plan is."""
@@ -177,9 +177,10 @@ class Targets:
         self._turned = turned
         self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
+        self._tries = TRIES
         self._log, self._looked = log, count(1)
-        self._what, self._steps, self._tries = "", 0, 0
-        """Which plan it is, its length, and how many more places of its steps are tried."""
+        self._what, self._steps = "", 0
+        """Which plan it is, and its length."""
 
     def of(
         self,
@@ -195,7 +196,7 @@ class Targets:
         Steps ``again`` failed before with the best poses and get those that come next. Items that are ``late``
         already may crowd others. ``what`` is said of how far it is.
         """
-        self._what, self._steps, self._tries = what, len(steps), TRIES
+        self._what, self._steps = what, len(steps)
         scene = self._on_its_table(scene)
         found = self._chosen(steps, scene, again, late)
         return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]

@@ -85,6 +85,7 @@ REASONS = {
     "opened": rf"the hand opened to {_NUMBER} mm of {_OF}",
     "not_home": r"no free motion home; too close: .*",
     "no_catalogue": r"the catalogue has no grasp for it",
+    "out_of_reach": r"it is out of reach",
     "unreachable": r"no grasp of it is reachable without a collision",
     "no_approach": r"no straight approach to a grasp",
     "no_lift": r"no way to lift it",

@@ -24,7 +24,7 @@ from stages.planning.places.sight import hidden_share
 from stages.planning.stepwise import stepwise
 from stages.planning.symbolic.problem import TABLE, Problem
 from stages.planning.symbolic.search import Step
-from stages.planning.targets import BRANCHES, TRIES, Blocked, Crowded, Next, Targets, Workspace, neighbours
+from stages.planning.targets import Crowded, Next, Targets, Workspace, neighbours
 from stages.scene.facing import SIDES, faced, turned_to
 from stages.scene.goals import without
 from stages.scene.stance import Standing, yawed
@@ -1007,23 +1007,6 @@ def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other()
     assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
     assert penetrations(executed(FULL_TRAY, found)) == []
     assert len(found.transfers) <= 10
-
-
-def test_places_that_one_plan_tried_are_not_counted_against_the_next(monkeypatch: pytest.MonkeyPatch):
-    """Wherever the box goes, nobody can put the tray on it."""
-    monkeypatch.setattr("stages.planning.targets.TOLD", 1)
-    known, lines = {name: stances(name) for name in ("tea_box", "tray")}, list[str]()
-    start = Layout().put("tea_box", 0.0, 0.2).put("tray", 0.1, -0.2)
-    goal = Layout().put("tea_box", 0.0, 0.2).put("tray", 0.0, 0.0, on="tea_box").graph()
-    handling = Handling(ROBOT, ROBOT.table, np.random.default_rng(0))
-    wanted = {"tea_box": TABLE, "tray": "tea_box"}
-    targets = Targets(Placements(goal, known, goal), Workspace(), ROBOT, handling, wanted, log=lines.append)
-    scene, looked = Scene.of(start.graph(), known), list[int]()
-    for _ in range(TRIES):
-        lines.clear()
-        assert isinstance(targets.of((Step("tea_box", TABLE, TABLE), Step("tray", TABLE, "tea_box")), scene), Blocked)
-        looked.append(len(lines))
-    assert looked == [1 + BRANCHES] * TRIES
 
 
 def test_one_transfer_after_the_other_also_leads_to_goals_that_do_not_say_where_a_carrier_is():
