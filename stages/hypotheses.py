@@ -72,7 +72,7 @@ class Hypotheses(Stage):
         max_hypotheses: int = 32
         """Cap on h without first looks, highest joint confidence first."""
         finalists: int = 8
-        """Cap on h with first looks, least cost first, on the revisions of a round, and on labels of a box."""
+        """Cap on h with first looks, least cost first, on the revisions and on the other labels of a round."""
         revisions: int = 4
         """Rounds in which the best scene is revised at most, where N_c is not known."""
         suggestions: bool = False
@@ -137,11 +137,11 @@ class Hypotheses(Stage):
             before = () if several else search.unexplained
             revised = combined(posteriors, earlier, search.offers)[: self.config.finalists]
             revised += revisions(best, search.offers, before)[: self.config.finalists]
-            most, relabels = self.config.finalists, relabelled(best, search.offers, before)
-            revised += some_of_each_box(relabels, search.offers, most, boxes=2)
+            revised += relabelled(best, search.offers, before)[: self.config.finalists]
             others = refitted(best, search.offers) + equalled(best, search.offers)
             revised += [each for each in dict.fromkeys(others) if each not in revised]
-            revised += some_of_each_box(suggested(best, search.offers, before), search.offers, most, boxes=3)
+            unexplained = suggested(best, search.offers, before)
+            revised += some_of_each_box(unexplained, search.offers, self.config.finalists, boxes=2)
         if search and revised:
             ctx.log(f"{len(revised)} revisions of the best scene, which leaves something unexplained or fits badly")
             following = msgspec.structs.replace(
