@@ -166,8 +166,9 @@ class Planner(Stage):
                 steps, scene, again=_failed_before(steps, task.avoid), late=problem.items, what="the rest"
             )
             if isinstance(poses, list):
-                left = shortened(zip(steps, poses, strict=True), problem, targets, scene, avoided=task.avoid)
-                return _solved(left, text, problem)
+                left = list(zip(steps, poses, strict=True))
+                # A detour that makes room for what failed looks needless: the planner found room before it failed, too.
+                return _solved(left if task.avoid else shortened(left, problem, targets, scene), text, problem)
         try:
             self._check(problem, task, violated[0])
             self._check_grasps(problem, self._scene(task), ctx)
