@@ -360,6 +360,8 @@ class Demonstrator(Stage):
             yield self._look_again("perception", f"in doubt: {', '.join(doubtful)}", ctx)
         elif self._state.goal is None and scene.unknown and self._may_see_more() and not self._state.ask:
             yield self._look_again("perception", _UNKNOWN, ctx)
+        elif self._state.goal is None and scene.contested and self._may_see_more():
+            yield self._look_again("perception", _contest(scene), ctx)
         elif self._state.goal is None:
             yield from self._remember(scene, ctx)
         else:
@@ -600,8 +602,8 @@ class Demonstrator(Stage):
         unsure = [
             f"{item.name} ({100 * (item.probability or 0):.0f} %)" for item in scene.objects if is_below(item, SURE)
         ]
-        if scene.unknown:
-            unsure.append(_UNKNOWN)
+        unsure += [_UNKNOWN] if scene.unknown else []
+        unsure += [_contest(scene)] if scene.contested else []
         if unsure:
             looks = self._state.repeats + 1
             ctx.log(
@@ -859,6 +861,10 @@ class AskedDemonstrator(KeepingDemonstrator):
 
 def _names(scene: SceneGraph) -> set[str]:
     return {item.name for item in scene.objects}
+
+
+def _contest(scene: SceneGraph) -> str:
+    return f"the detector also sees {', '.join(scene.contested)}"
 
 
 def _doubtful_parents(goal: SceneGraph) -> list[str]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 
 import msgspec
 import numpy as np
@@ -12,6 +15,7 @@ from runner.contract import Context, Stage
 from stages.messages import ObjectPose, Observation, SceneEstimate
 from stages.messages.digest import Contender
 from stages.perception.hypotheses.duplicates import is_same_scene, without_doubles
+from stages.scene.doubts import UNSURE
 from stages.scene.naming import Named, names_kept, unique_names
 
 
@@ -51,6 +55,7 @@ class Ranker(Stage):
             support=observation.support,
             lambda_r=best.lambda_r,
             repeated=_repeated(scenes, np.argsort(-log_weights, kind="stable").tolist()),
+            contested=_contested(scenes[winner], scenes),
         )
 
     def _named(self, objects: Sequence[ObjectPose], observation: Observation) -> tuple[ObjectPose, ...]:
@@ -63,6 +68,13 @@ class Ranker(Stage):
         names = unique_names(labels, names_kept(labels, places, self._known))
         self._known = {**self._known, **dict(zip(names, map(Named, labels, places), strict=True))}
         return tuple(msgspec.structs.replace(item, name=name) for item, name in zip(objects, names, strict=True))
+
+
+def _contested(best: Sequence[ObjectPose], scenes: Sequence[Sequence[ObjectPose]]) -> tuple[str, ...]:
+    """Labels of which another scene has more objects that the detector takes for likely than the best one has."""
+    likely = (Counter(item.label for item in scene if item.confidence >= UNSURE) for scene in scenes)
+    most = reduce(or_, likely, Counter[str]())
+    return tuple(sorted(most - Counter(item.label for item in best)))
 
 
 def _repeated(scenes: Sequence[Sequence[ObjectPose]], order: Sequence[int]) -> tuple[int, ...]:

@@ -1001,6 +1001,18 @@ def test_a_goal_with_something_unknown_is_looked_at_again_before_it_is_remembere
     assert isinstance(episode.seen(open_goal)[0], Goal)  # Somebody is there, and was asked about it if need be.
 
 
+def test_a_goal_in_which_the_detector_sees_more_is_looked_at_again_before_it_is_remembered() -> None:
+    contested = msgspec.structs.replace(GOAL, contested=("sponge",))
+    episode = Episode(scripted=False)
+    episode.called(Teach(name="tea"))
+    assert episode.seen(contested) == [LookRequest(purpose="goal tea, look 2")]
+    assert "the detector also sees sponge; looking again" in episode.ctx.lines
+    assert isinstance(episode.seen(GOAL)[0], Goal)
+    episode.called(Teach(name="tea"))
+    assert isinstance([episode.seen(contested) for _ in range(3)][-1][0], Goal)
+    assert any("remembered all the same: the detector also sees sponge" in line for line in episode.ctx.lines)
+
+
 @pytest.mark.parametrize("probability", [0.6, 0.95])
 def test_no_success_is_claimed_where_a_place_turns_with_what_was_in_doubt(probability: float) -> None:
     """Beside the tray stands a can; which way the tray lies was in doubt, look after look."""

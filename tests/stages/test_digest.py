@@ -417,6 +417,18 @@ def test_a_scene_that_is_found_twice_is_one_scene(seen: Rendered) -> None:
     assert (estimate.winner, estimate.repeated) == (2, (0,))
 
 
+def test_what_the_detector_takes_for_likely_and_the_best_scene_lacks_is_named(seen: Rendered) -> None:
+    """A cup less likely than not, and a mug that the best scene has elsewhere, are no contest; a second mug is."""
+    (observation, *_), ctx = enumerate_(Hypotheses.Config(n_objects=1), frame(seen), both(seen))
+    mug, tea_box, cup = estimate_of(dict.fromkeys(("mug", "tea_box", "cup"), seen.poses["mug"])).objects
+    second = msgspec.structs.replace(mug, T_camera_object=seen.poses["tea_box"])
+    sets = (mug,), (mug, tea_box), (tea_box, msgspec.structs.replace(cup, confidence=0.49)), (mug, second)
+    for among, contested in ((sets[:1], ()), (sets[:3], ("tea_box",)), (sets, ("mug", "tea_box"))):
+        contenders = [msgspec.structs.replace(contender(i, -1.0 - i), objects=one) for i, one in enumerate(among)]
+        estimate = Ranker(Ranker.Config()).on_contenders(contenders, observation, ctx)
+        assert (estimate.winner, estimate.contested) == (0, contested)
+
+
 def seen_from_a_known_camera(*xs: float) -> tuple[list[Contender], Observation]:
     """Cups along the robot's x axis, the most confident first."""
     cups = tuple(
