@@ -202,7 +202,8 @@ class Comparison:
                 self._diverge(step, id, "recorded, and not emitted in the replay")
             elif id in self._recording.messages:
                 self._compare(step, self._recording.envelope(id), sealed)
-        if step.outcome != "stopped" and not (step.error.startswith(done.error) if done.error else not step.error):
+        recorded_so = step.error == done.error or step.error.startswith(f"{done.error} (")  # with where it was raised
+        if step.outcome != "stopped" and not recorded_so:
             text = f"recorded {step.error or 'no error'!r}, replayed {done.error or 'no error'!r}"
             self._diverge(step, "-", f"error: {text}")
 

@@ -9,6 +9,8 @@ import pytest
 
 from runner.message.codec import Envelope, Lost, Step, decode, envelope, pack, unpack
 from runner.recording.recording import Recording
+from runner.replay.replay import change
+from runner.replay.tasks import Comparison, Execution
 from tests.runner.common.recordings import record_toys, rewrite
 from tests.runner.common.toys import Answer
 
@@ -143,6 +145,23 @@ def test_each_incarnation_is_a_fresh_instance_that_goes_on_counting(tmp_path: Pa
     assert code == 0, said
     assert "gatherer: 2 steps, 2 messages" in said
     assert "gatherer after restart 1: 3 steps, 3 messages" in said
+
+
+@pytest.mark.parametrize(
+    ("recorded", "diverged"),
+    [
+        ("ValueError: limit 1 (odd.py:7 in on_number)", 0),
+        ("ValueError: limit 1", 0),
+        ("ValueError: limit 12 (odd.py:7 in on_number)", 1),
+        ("", 1),
+    ],
+)
+def test_an_error_is_the_same_where_all_of_it_is(toys: Path, recorded: str, diverged: int):
+    recording = Recording(toys)
+    comparison = Comparison(recording, change(recording).nodes["gatherer"], {})
+    step = Step("gatherer", 0, 0, 0, "on_answers", (), (), 0, 0, 0, 0, "failed", recorded)
+    comparison.add(Execution(step, error="ValueError: limit 1"))
+    assert comparison.result.diverged == diverged
 
 
 def test_a_setting_that_does_not_exist_is_refused(toys: Path):
