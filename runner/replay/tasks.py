@@ -6,7 +6,7 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
 
@@ -114,7 +114,8 @@ class Reexecution:
     ) -> None:
         """Constructs the stage; raises Refused where that fails."""
         self._recording = recording
-        self._node = node
+        replicas = recording.graph["stages"][node.name].get("replicas", 1)
+        self._node = node = replace(node, replicas=replicas)  # whether or not there were several, ids say
         self.stage = node.construct()
         numbers: dict[str, int] = {}  # where the sequence of each port went on in this incarnation
         for id in (MessageId.of(id) for step in steps for id in step.emitted):

@@ -271,3 +271,13 @@ def test_any_number_of_workers_gives_the_same_bytes(toys: Path, workers: int):
     code, said = verify(toys, workers=workers)
     assert code == 0, said
     assert "IDENTICAL: 45 messages of 3 stages" in said
+
+
+@pytest.mark.parametrize(("then", "now"), [(2, 1), (1, 2)])
+def test_another_number_of_replicas_gives_the_same_ids(tmp_path: Path, then: int, now: int):
+    path, _ = record_toys(tmp_path, f"worker.replicas={then}")
+    code, said = verify(path, f"worker.replicas={now}")
+    assert code == 0, said
+    assert "IDENTICAL: 45 messages of 3 stages" in said
+    _, said = replay(path, "--until", "worker.answer#7", "--set", f"worker.replicas={now}")
+    assert "executed again: identical to the recording" in said
