@@ -45,7 +45,8 @@ class Result(msgspec.Struct):
     """How a task ended, or how far it has come."""
 
     steps: int = 0
-    messages: int = 0
+    compared: list[str] = msgspec.field(default_factory=list[str])
+    """Ids of recorded messages."""
     seconds: float = 0.0
     """Processor time inside handlers, which does not depend on what else runs."""
     startup: float = 0.0
@@ -64,7 +65,7 @@ class Result(msgspec.Struct):
             return f"could not be executed: {self.failure}"
         words = [f"{self.diverged} DIVERGED"] if self.diverged else []
         words += [f"{self.within} within tolerances"] if self.within else []
-        counts = f"{self.steps} steps, {self.messages} messages, {self.seconds:.2f} s"
+        counts = f"{self.steps} steps, {len(self.compared)} messages, {self.seconds:.2f} s"
         return f"{counts}, {', '.join(words) or 'identical'}"
 
 
@@ -209,7 +210,7 @@ class Comparison:
             self._diverge(step, "-", f"error: {text}")
 
     def _compare(self, step: Step, recorded: Envelope, replayed: Envelope) -> None:
-        self.result.messages += 1
+        self.result.compared.append(recorded.id)
         kind = self._node.type.outputs[MessageId.of(replayed.id).port]
         other = what_differs(recorded, replayed, kind)
         if other is None:

@@ -7,11 +7,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, Lost, Step, decode, envelope, pack, unpack
 from runner.recording.recording import Recording
 from runner.replay.replay import change
 from runner.replay.tasks import Comparison, Execution
-from tests.runner.common.recordings import record_toys, rewrite
+from tests.runner.common.recordings import ToyRun, record, record_toys, rewrite
 from tests.runner.common.toys import Answer
 
 TABLE = "tolerances=tests.runner.common.toys:TOLERANCES"
@@ -162,6 +163,31 @@ def test_an_error_is_the_same_where_all_of_it_is(toys: Path, recorded: str, dive
     step = Step("gatherer", 0, 0, 0, "on_answers", (), (), 0, 0, 0, 0, "failed", recorded)
     comparison.add(Execution(step, error="ValueError: limit 1"))
     assert comparison.result.diverged == diverged
+
+
+@pytest.mark.parametrize(("journalled", "said_so"), [(4, "44 of 45 messages of 3"), (0, "40 of 45 messages of 3")])
+def test_what_no_step_has_emitted_is_said_not_to_be_compared(tmp_path: Path, journalled: int, said_so: str):
+    """As if the gatherer had been killed after it had sent a total and before its step was journalled."""
+
+    def before(record: Envelope | Step) -> Envelope | Step | None:
+        late = isinstance(record, Step) and record.stage == "gatherer" and record.number >= journalled
+        return None if late else record
+
+    path, verdict = record_toys(tmp_path, keep=before, more=[Lost("gatherer", 0, 0, "killed", 0)])
+    assert verdict.complete, verdict
+    code, said = verify(path)
+    assert code == 0, said
+    assert f"IDENTICAL: {said_so} stages; of no step that was done: gatherer.total#{journalled}" in said
+
+
+def test_where_nothing_is_compared_nothing_is_verified(tmp_path: Path):
+    file = tmp_path / "alone.yaml"
+    file.write_text("name: alone\nstages: {counter: {stage: tests.runner.common.toys:Counter}}")
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "alone.mcap", ToyRun(graph, tmp_path).records())
+    code, said = verify(path)
+    assert code == 1
+    assert "NOT VERIFIED: 0 of 0 messages compared, none differs; COMPLETE" in said
 
 
 def test_a_setting_that_does_not_exist_is_refused(toys: Path):
