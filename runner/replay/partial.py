@@ -226,7 +226,7 @@ class PartialReplay:
             self.errors.append(f"{name}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
-            self.frozen.came(sealed.id)
+            self.frozen.note(sealed.id)
             self._deliver(sealed)
 
     def _deliver(self, sealed: Envelope) -> None:
@@ -260,9 +260,9 @@ class Frozen:
     """The messages that stay as recorded: each comes once all that it answers has come."""
 
     def __init__(self, recording: Recording, names: Collection[str]) -> None:
-        self.released: dict[str, Envelope] = {}
+        self.came: set[str] = set()
+        """Ids of all that has come, recorded or new."""
         self._recording = recording
-        self._came: set[str] = set()
         self._positions = {id: position for position, id in enumerate(recording.messages)}
         frozen = (id for id in recording.messages if MessageId.of(id).stage not in names)
         self._free = [(self._positions[id], id) for id in frozen]
@@ -275,17 +275,16 @@ class Frozen:
         while self._free:
             _, id = heapq.heappop(self._free)
             sealed = self._recording.envelope(id)
-            lacking = (one for one in sealed.causes if one in self._positions and one not in self._came)
+            lacking = (one for one in sealed.causes if one in self._positions and one not in self.came)
             if (cause := next(lacking, None)) is None:
-                self.released[id] = sealed
-                self.came(id)
+                self.note(id)
                 return sealed
             self._waiting[cause].append(id)
         return None
 
-    def came(self, id: str) -> None:
-        """Takes note of a message, recorded or new."""
-        self._came.add(id)
+    def note(self, id: str) -> None:
+        """Takes note of a message that has come."""
+        self.came.add(id)
         for waiting in self._waiting.pop(id, ()):
             heapq.heappush(self._free, (self._positions[waiting], waiting))
 

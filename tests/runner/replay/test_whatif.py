@@ -3,10 +3,12 @@
 import os
 import threading
 import time
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from runner.cli.main import main
@@ -15,8 +17,10 @@ from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, Step, decode
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
+from runner.replay.partial import Frozen
 from tests.runner.common import toys as toy_stages
 from tests.runner.common.recordings import ToyRun, record, record_toys
+from tests.runner.common.runs import TOYS
 from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Piece, Total, Worker
 from tests.runner.replay.test_replay import replay
 
@@ -267,6 +271,19 @@ def test_stages_are_closed_at_the_end(toys: Path, tmp_path: Path, monkeypatch: p
     code, said = replay(toys, "--swap", "gatherer=tests.runner.replay.test_whatif:Closing")
     assert code == 0, said
     assert (tmp_path / "closed").exists()
+
+
+def test_what_stays_as_recorded_is_not_held_in_memory(tmp_path: Path):
+    body = msgspec.Raw(msgspec.msgpack.encode({"pixels": bytes(2**20)}))
+    pictures = (Envelope(f"camera.picture#{k}", f"camera.picture#{k}", k, "Picture", 1, (), body) for k in range(100))
+    path, _ = record(load_graph(TOYS, (f"sink.path={tmp_path}",)), tmp_path / "pictures.mcap", pictures)
+    frozen = Frozen(Recording(path), ())
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in iter(frozen.next, None)) == 100
+        assert tracemalloc.get_traced_memory()[1] < 50 * 2**20
+    finally:
+        tracemalloc.stop()
 
 
 def test_another_seed_executes_everything(toys: Path):
