@@ -194,7 +194,9 @@ class PartialReplay:
                 if key is not None:
                     self._dispatch(stage, key)
                     return True
-            if self._ahead < AHEAD and (sealed := self.frozen.next()) is not None:
+            waiting = sum(len(stage.ready) for stage in self._stages.values())
+            ahead = max(self._ahead, waiting) if self._running else 0
+            if ahead < AHEAD and (sealed := self.frozen.next()) is not None:
                 self._ahead += bool(self._running)
                 self._deliver(sealed)
                 return True
