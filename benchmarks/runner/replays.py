@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import median
 
 ROOT = Path(__file__).parents[2]
-IDENTICAL = re.compile(r"^IDENTICAL: (\d+) messages", re.MULTILINE)
+IDENTICAL = re.compile(r"^IDENTICAL: (\d+)(?: of \d+)? messages", re.MULTILINE)
 TIMES = re.compile(r"handlers took ([\d.]+) s .*\(when recorded ([\d.]+) s\), constructing the stages ([\d.]+) s")
 
 

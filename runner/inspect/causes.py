@@ -8,6 +8,9 @@ from runner.inspect.info import seconds
 from runner.message.codec import Step
 from runner.recording.recording import Recording
 
+INDENT = 3 * 40
+"""Characters before what lies deepest; what leads to that stands below it, as far to the right."""
+
 
 class Causes:
     """Which step emitted each message of a recording, and what that step had consumed."""
@@ -33,10 +36,11 @@ class Causes:
 
     def path_to(self, id: str) -> list[str]:
         """The critical path from the start of a message's lineage to it: at each step the input that came last."""
-        root, path = self._root_of(id), [id]
-        while path[-1] != root and (cause := self.last_input(path[-1])) is not None and cause not in path:
-            path.append(cause)
-        return path[::-1]
+        root, path, current = self._root_of(id), dict[str, None](), id
+        while current is not None and current not in path:
+            path[current] = None
+            current = self.last_input(current) if current != root else None
+        return list(path)[::-1]
 
     def tree_of(self, id: str) -> Iterator[str]:
         """The tree of causes as lines: each message with the queueing, transport and computing of its step.
@@ -59,7 +63,7 @@ class Causes:
             yield f"{lead}{branch}{f'{port}: ' if port else ''}{current}{note}"
             if repeated or current == root:
                 continue
-            below = lead + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch]
+            below = (lead + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch])[:INDENT]
             inputs = self.inputs_of(current)
             branches = ["├─ "] * (len(inputs) - 1) + ["└─ "]
             children = [(below, mark, port, cause) for mark, (port, cause) in zip(branches, inputs, strict=False)]
@@ -83,6 +87,8 @@ class Causes:
 
 
 def last_recorded(recording: Recording, ids: Iterable[str]) -> str | None:
-    """The message that was recorded last; None where there are none."""
-    messages = recording.messages
-    return max(ids, key=lambda id: messages[id].log_time_ns if id in messages else 0, default=None)
+    """The message that was recorded last; None where there are none, or several of which none is recorded."""
+    several, messages = list(ids), recording.messages
+    if recorded := [id for id in several if id in messages]:
+        return max(recorded, key=lambda id: messages[id].log_time_ns)
+    return several[0] if len(several) == 1 else None

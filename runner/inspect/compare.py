@@ -92,7 +92,7 @@ def _body_differences(recorded: Envelope, replayed: Envelope, kind: type[Message
 
 def _mapping_differences(recorded: dict[Any, Any], replayed: dict[Any, Any], field: str, owner: str) -> Differences:
     if recorded.keys() != replayed.keys():
-        keys = _show(sorted(recorded)), _show(sorted(replayed))
+        keys = _show(sorted(recorded, key=repr)), _show(sorted(replayed, key=repr))
         yield Difference(field or "fields", *keys, "keys differ", owner=owner)
     for key in filter(replayed.__contains__, recorded):
         place = f"{field}.{key}".lstrip(".") if isinstance(recorded, Fields) else f"{field}[{key!r}]"

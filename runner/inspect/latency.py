@@ -75,8 +75,10 @@ def _cost(hop: Step) -> int:
 def _edges(recording: Recording) -> list[str]:
     """A step's waiting is its last input's: what waits for a partner at a join is not late."""
     by_edge: dict[str, list[Step]] = defaultdict(list)
+    unknown = 0
     for step in recording.steps:
         last = last_recorded(recording, (id for _, id in step.consumed))
+        unknown += last is None and bool(step.consumed)
         if last is not None:
             port = next(port for port, id in step.consumed if id == last)
             by_edge[f"{MessageId.of(last).topic} -> {step.stage}.{port}"].append(step)
@@ -89,7 +91,8 @@ def _edges(recording: Recording) -> list[str]:
         )
         for edge, steps in sorted(by_edge.items())
     ]
-    return table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), rows)
+    left_out = f"left out: {unknown} steps that took several messages; no message is recorded that says which came last"
+    return [*table(("edge", "count", "travel p50", "p99", "queue p50", "p99"), rows), *([left_out] if unknown else [])]
 
 
 def _stages(steps: Iterable[Step]) -> list[str]:

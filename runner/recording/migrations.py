@@ -72,10 +72,11 @@ def _edited(value: Any, path: list[str], name: str | None) -> Any:
 
 def _shared(old: Any, new: Any, value: Any) -> Any:
     """What is new, of structs the fields that what is old has, in their order. ``value`` is what is new with its types:
-    they tell structs from dicts."""
+    they tell structs from dicts. Of a struct that leaves defaults out, what is old has had every field."""
     match value, old, new:
         case msgspec.Struct(), dict(), dict():
-            return {key: _shared(old[key], new[key], getattr(value, key, None)) for key in old if key in new}
+            shared = {key: _shared(old[key], new[key], getattr(value, key, None)) for key in old if key in new}
+            return {**shared, **new, **shared} if value.__struct_config__.omit_defaults else shared
         case dict(), dict(), dict():
             pairs = zip(new.items(), value.values(), strict=True)
             return {key: _shared(old.get(key), inner, typed) for (key, inner), typed in pairs}

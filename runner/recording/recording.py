@@ -146,6 +146,8 @@ class Recording:
         self.messages: dict[str, Located] = {}
         self.steps: list[Step] = []
         """What handlers did; not that a process ended, nor what the supervisor sent."""
+        self.ends: list[Step] = []
+        """The last record of each process that ended in order."""
         self.log: list[LogLine] = []
         self.lost: list[Lost] = []
         """Processes that died."""
@@ -231,7 +233,7 @@ class Recording:
         return (self.envelope(id) for id in self.messages)
 
     def _forget(self) -> None:
-        lists = self.steps, self.log, self.lost, self._order
+        lists = self.steps, self.ends, self.log, self.lost, self._order
         for entered in (self.metadata, self._misplaced, self.messages, self.repeated, *lists):
             entered.clear()
 
@@ -258,7 +260,9 @@ class Recording:
         record = unpack(payload_kind(entry.topic), data)
         match record:
             case Step():
-                if record.outcome != "ended" and record.stage != SUPERVISOR:
+                if record.outcome == "ended":
+                    self.ends.append(record)
+                elif record.stage != SUPERVISOR:
                     self.steps.append(record)
             case LogLine():
                 self.log.append(record)
@@ -319,9 +323,7 @@ class Recording:
     @property
     def _says_ends(self) -> bool:
         """Whether it says how processes ended, which the first recordings did not."""
-        if "format" in self.run or "counts" in self.metadata.get(VERDICT, {}) or self.lost:
-            return True
-        return any(isinstance(record, Step) and record.outcome == "ended" for _, _, record, *_ in self._order)
+        return bool("format" in self.run or "counts" in self.metadata.get(VERDICT, {}) or self.lost or self.ends)
 
     def _prove(self) -> Proof:
         proof = Proof(self.graph)

@@ -27,8 +27,9 @@ class Expression:
             self._code = compile(tree, "--break", "eval")
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise self._refused(f"is no expression of Python: {error}") from None
-        names = (node for node in ast.walk(tree) if isinstance(node, ast.Name))
-        variables = {node.id for node in names if isinstance(node.ctx, ast.Store)}
+        nodes = list(ast.walk(tree))
+        variables = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+        variables |= {node.arg for node in nodes if isinstance(node, ast.arg)}
         self._others = {"np", *dir(builtins), *variables} - ports.keys()
         self.topics = frozenset(self._topics(tree))
         """``stage/port`` of all that it names."""

@@ -8,6 +8,7 @@ stands still before the oldest step that could run is taken instead.
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,12 +18,12 @@ from typing import cast
 
 import msgspec
 
-from runner.contract import Refused
+from runner.contract import Part, Refused
 from runner.graph.graph import Edge, Graph, Node
-from runner.message.codec import CodecError, Envelope
+from runner.message.codec import CodecError, Envelope, Step, decode_untyped
 from runner.message.ids import MessageId
 from runner.process.inbox import Inbox, Mismatched, Ready
-from runner.process.step import Executor, receive, step_time
+from runner.process.step import Arrival, Executor, receive, step_time
 from runner.recording.recording import Recording, replicated
 from runner.replay.workers import Worker
 
@@ -42,6 +43,8 @@ class Request(msgspec.Struct, frozen=True):
     inputs: tuple[tuple[str, Envelope], ...]
     """By port."""
     time_ns: int
+    most: int | None = None
+    """Messages after which the handler is stopped, as it was when the graph ended."""
 
 
 class Answer(msgspec.Struct, frozen=True):
@@ -71,7 +74,7 @@ def _answer(node: Node, executor: Executor, request: Request) -> Answer:
     handler = next(handler for handler in node.type.handlers if handler.name == request.handler)
     try:
         arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
-        emitted += executor.run(handler, arrivals, request.time_ns)
+        emitted += itertools.islice(executor.run(handler, arrivals, request.time_ns), request.most)
     except Exception as problem:
         error = f"{type(problem).__name__}: {problem}"
     return Answer(tuple(emitted), error)
@@ -129,8 +132,11 @@ class PartialReplay:
         self._graph = graph
         self._workers = workers
         self._unordered = _unordered(recording, graph)
-        self._ranks, self._times = _journal(recording, self._unordered)
+        self._journal = _journal(recording, self._unordered)
+        self._ranks = {key: rank for rank, key in enumerate(self._journal)}
         self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
+        self._left = {(end.stage, port, id) for end in recording.ends for port, id in end.left} - self._consumed
+        """What had come when the graph ended, and no step had taken."""
         self.frozen = Frozen(recording, names)
         self._ahead = 0
         self._running: dict[Connection, tuple[_Stage, Key, Worker]] = {}
@@ -188,7 +194,9 @@ class PartialReplay:
                 if key is not None:
                     self._dispatch(stage, key)
                     return True
-            if self._ahead < AHEAD and (sealed := self.frozen.next()) is not None:
+            waiting = sum(len(stage.ready) for stage in self._stages.values())
+            ahead = max(self._ahead, waiting) if self._running else 0
+            if ahead < AHEAD and (sealed := self.frozen.next()) is not None:
                 self._ahead += bool(self._running)
                 self._deliver(sealed)
                 return True
@@ -212,8 +220,10 @@ class PartialReplay:
     def _dispatch(self, stage: _Stage, key: Key) -> None:
         ready, child = stage.take(key)
         inputs = tuple((arrival.port.name, arrival.envelope) for arrival in ready.arrivals)
-        time_ns = step_time(stage.node, ready.arrivals, self._times.get(key, 0))
-        child.send(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns)))
+        step = self._journal.get(key)
+        time_ns = step_time(stage.node, ready.arrivals, step.time_ns if step else 0)
+        most = len(step.emitted) if step and step.outcome == "stopped" else None
+        child.send(msgspec.msgpack.encode(Request(ready.handler.name, inputs, time_ns, most)))
         self._running[child.connection] = (stage, key, child)
 
     def _collect(self) -> None:
@@ -222,11 +232,12 @@ class PartialReplay:
         answer = _answer_of(child, name)
         self._ahead = 0
         stage.idle.append(child)
-        if answer.error:
+        step = self._journal.get(key)
+        if answer.error and (step is None or answer.error != step.error):  # else a command that was refused then, too
             self.errors.append(f"{name}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
-            self.frozen.came(sealed.id)
+            self.frozen.note(sealed.id)
             self._deliver(sealed)
 
     def _deliver(self, sealed: Envelope) -> None:
@@ -245,7 +256,23 @@ class PartialReplay:
         except (CodecError, Mismatched) as error:
             self.errors.append(f"{stage.node.name}.{port}: {sealed.id} refused: {error}")
         while ready := stage.inbox.pop():
-            stage.add(ready)
+            if not self._was_left(stage.node, ready):
+                stage.add(ready)
+
+    def _was_left(self, node: Node, ready: Ready) -> bool:
+        """Whether a step could have run in the recorded run, too, which ended before."""
+        left = any((node.name, arrival.port.name, arrival.envelope.id) in self._left for arrival in ready.arrivals)
+        return left and all(map(self._was_there, ready.arrivals))
+
+    def _was_there(self, arrival: Arrival) -> bool:
+        """Whether a message was recorded as one of the same lineage and, where it is gathered, of as many."""
+        recorded = self._recording.messages.get(arrival.envelope.id)
+        if recorded is None or recorded.lineage != arrival.envelope.lineage:
+            return False
+        if arrival.port.kind == "one":
+            return True
+        then = decode_untyped(self._recording.envelope(recorded.id).body)
+        return then.get("count") == cast("Part", arrival.message).count
 
 
 def _answer_of(child: Worker, what: str) -> Answer:
@@ -260,9 +287,9 @@ class Frozen:
     """The messages that stay as recorded: each comes once all that it answers has come."""
 
     def __init__(self, recording: Recording, names: Collection[str]) -> None:
-        self.released: dict[str, Envelope] = {}
+        self.came: set[str] = set()
+        """Ids of all that has come, recorded or new."""
         self._recording = recording
-        self._came: set[str] = set()
         self._positions = {id: position for position, id in enumerate(recording.messages)}
         frozen = (id for id in recording.messages if MessageId.of(id).stage not in names)
         self._free = [(self._positions[id], id) for id in frozen]
@@ -275,17 +302,16 @@ class Frozen:
         while self._free:
             _, id = heapq.heappop(self._free)
             sealed = self._recording.envelope(id)
-            lacking = (one for one in sealed.causes if one in self._positions and one not in self._came)
+            lacking = (one for one in sealed.causes if one in self._positions and one not in self.came)
             if (cause := next(lacking, None)) is None:
-                self.released[id] = sealed
-                self.came(id)
+                self.note(id)
                 return sealed
             self._waiting[cause].append(id)
         return None
 
-    def came(self, id: str) -> None:
-        """Takes note of a message, recorded or new."""
-        self._came.add(id)
+    def note(self, id: str) -> None:
+        """Takes note of a message that has come."""
+        self.came.add(id)
         for waiting in self._waiting.pop(id, ()):
             heapq.heappush(self._free, (self._positions[waiting], waiting))
 
@@ -311,19 +337,17 @@ def _sequence(consumed: Iterable[tuple[str, str]], port: str | None) -> int | No
     return next((MessageId.of(id).sequence for name, id in consumed if name == port), None)
 
 
-def _journal(recording: Recording, unordered: Mapping[tuple[str, str], str]) -> tuple[dict[Key, int], dict[Key, int]]:
-    """The order and the logical time of every step that was done."""
-    done = [step for step in recording.steps if step.outcome == "done" and step.handler != "source"]
-    done.sort(key=lambda step: step.incarnation)  # stable: within a process the journal has them in order
+def _journal(recording: Recording, unordered: Mapping[tuple[str, str], str]) -> dict[Key, Step]:
+    """Every step that was done, or stopped at the end of the graph, in their order."""
+    taken = [step for step in recording.steps if step.outcome in ("done", "stopped") and step.handler != "source"]
+    taken.sort(key=lambda step: step.incarnation)  # stable: within a process the journal has them in order
     counts: Counter[tuple[str, str, str]] = Counter()
-    ranks: dict[Key, int] = {}
-    times: dict[Key, int] = {}
-    for step in done:
+    journal: dict[Key, Step] = {}
+    for step in taken:
         known = (recording.messages[id].lineage for _, id in step.consumed if id in recording.messages)
         place = (step.stage, step.handler, next(known, ""))
         driven = _sequence(step.consumed, unordered.get((step.stage, step.handler)))
         key = (*place, counts[place] if driven is None else driven)
         counts[place] += 1
-        ranks.setdefault(key, len(ranks))  # each replica takes a step for what they do not share
-        times.setdefault(key, step.time_ns)
-    return ranks, times
+        journal.setdefault(key, step)  # each replica takes a step for what they do not share
+    return journal

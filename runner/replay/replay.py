@@ -32,6 +32,7 @@ from runner.recording.recording import Recording, replicated
 from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
 from runner.replay.tolerances import compare_origin
 from runner.replay.workers import run_each
+from runner.terminal import listed
 
 
 def change(recording: Recording, assignments: Sequence[str] = (), swaps: Sequence[str] = ()) -> Graph:
@@ -73,8 +74,8 @@ def plan(path: Path) -> list[str]:
 def verify(path: Path, assignments: Sequence[str], *, workers: int) -> int:
     """Executes everything again in ``workers`` processes at a time and compares every byte.
 
-    Prints what comes of it. Returns 0 where every message is identical, or where this machine is another and every
-    message within the graph's tolerances; else 1. Raises Refused where the file is no recording.
+    Prints what comes of it. Returns 0 where every message of a step is identical, or where this machine is another and
+    every one within the graph's tolerances; else 1, also of no message. Raises Refused where the file is no recording.
     """
     began = time.perf_counter()
     recording = Recording(path)
@@ -153,25 +154,28 @@ def _cost(recording: Recording, results: Mapping[Task, Result], wall: float) -> 
 def _verdict(recording: Recording, graph: Mapping[str, Any], results: Mapping[Task, Result]) -> tuple[int, str]:
     """The exit status and what it means."""
     executed = {task.stage for task in results}
-    compared = sum(result.messages for result in results.values())
+    expected = [id for id in recording.messages if MessageId.of(id).stage in executed]
+    compared = {id for result in results.values() for id in result.compared}
     within = sum(result.within for result in results.values())
     found = [result.first for result in results.values() if result.first]
     if found:
         return 1, f"DIVERGED first at {min(found, key=itemgetter(0))[1]}"
-    if any(result.failure for result in results.values()) or not recording.verdict.complete:
-        expected = sum(MessageId.of(id).stage in executed for id in recording.messages)
+    if any(result.failure for result in results.values()) or not recording.verdict.complete or not compared:
         none = "none differs" if not within else f"{within} within tolerances, none beyond"
-        return 1, f"NOT VERIFIED: {compared} of {expected} messages compared, {none}; {recording.verdict}"
+        return 1, f"NOT VERIFIED: {len(compared)} of {len(expected)} messages compared, {none}; {recording.verdict}"
+    undone = [id for id in expected if id not in compared]
+    counts = f"{len(compared)} of {len(expected)}" if undone else f"{len(compared)}"
     stages = f"of {len(executed)} stages"
+    rest = f"; of no step that was done: {listed(undone)}" if undone else ""
     if within:
         allowed = f"none by more than {graph.get('tolerances')} allows"
-        return 0, f"WITHIN TOLERANCES: {within} of {compared} messages {stages} differ, {allowed}"
-    return 0, f"IDENTICAL: {compared} messages {stages}"
+        return 0, f"WITHIN TOLERANCES: {within} of {len(compared)} messages {stages} differ, {allowed}{rest}"
+    return 0, f"IDENTICAL: {counts} messages {stages}{rest}"
 
 
 def _by_cost(recording: Recording) -> list[str]:
-    """The stages that took steps, those that computed longest first."""
-    cost: Counter[str] = Counter()
+    """The stages that took steps or sent messages, those that computed longest first."""
+    cost = Counter({MessageId.of(id).stage: 0 for id in recording.messages})
     for step in recording.steps:
         cost[step.stage] += step.computed_ns
     return [stage for stage, _ in cost.most_common() if stage in recording.graph["stages"]]
@@ -182,4 +186,5 @@ def tasks_of(recording: Recording, node: Node, workers: int) -> list[Task]:
     if node.name in replicated(recording.graph):
         return [Task(node.name, 0, share, workers) for share in range(workers)]
     lived = {step.incarnation for step in recording.steps if step.stage == node.name}
-    return [Task(node.name, incarnation) for incarnation in ([0] if node.type.cls.stateful else sorted(lived))]
+    incarnations = [0] if node.type.cls.stateful else sorted(lived) or [0]
+    return [Task(node.name, incarnation) for incarnation in incarnations]

@@ -6,7 +6,7 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
 
@@ -45,7 +45,8 @@ class Result(msgspec.Struct):
     """How a task ended, or how far it has come."""
 
     steps: int = 0
-    messages: int = 0
+    compared: list[str] = msgspec.field(default_factory=list[str])
+    """Ids of recorded messages."""
     seconds: float = 0.0
     """Processor time inside handlers, which does not depend on what else runs."""
     startup: float = 0.0
@@ -64,7 +65,7 @@ class Result(msgspec.Struct):
             return f"could not be executed: {self.failure}"
         words = [f"{self.diverged} DIVERGED"] if self.diverged else []
         words += [f"{self.within} within tolerances"] if self.within else []
-        counts = f"{self.steps} steps, {self.messages} messages, {self.seconds:.2f} s"
+        counts = f"{self.steps} steps, {len(self.compared)} messages, {self.seconds:.2f} s"
         return f"{counts}, {', '.join(words) or 'identical'}"
 
 
@@ -114,7 +115,8 @@ class Reexecution:
     ) -> None:
         """Constructs the stage; raises Refused where that fails."""
         self._recording = recording
-        self._node = node
+        replicas = recording.graph["stages"][node.name].get("replicas", 1)
+        self._node = node = replace(node, replicas=replicas)  # whether or not there were several, ids say
         self.stage = node.construct()
         numbers: dict[str, int] = {}  # where the sequence of each port went on in this incarnation
         for id in (MessageId.of(id) for step in steps for id in step.emitted):
@@ -202,12 +204,13 @@ class Comparison:
                 self._diverge(step, id, "recorded, and not emitted in the replay")
             elif id in self._recording.messages:
                 self._compare(step, self._recording.envelope(id), sealed)
-        if step.outcome != "stopped" and not (step.error.startswith(done.error) if done.error else not step.error):
+        recorded_so = step.error == done.error or step.error.startswith(f"{done.error} (")  # with where it was raised
+        if step.outcome != "stopped" and not recorded_so:
             text = f"recorded {step.error or 'no error'!r}, replayed {done.error or 'no error'!r}"
             self._diverge(step, "-", f"error: {text}")
 
     def _compare(self, step: Step, recorded: Envelope, replayed: Envelope) -> None:
-        self.result.messages += 1
+        self.result.compared.append(recorded.id)
         kind = self._node.type.outputs[MessageId.of(replayed.id).port]
         other = what_differs(recorded, replayed, kind)
         if other is None:

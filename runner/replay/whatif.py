@@ -134,7 +134,7 @@ def _verdict(recording: Recording, graph: Graph, names: Sequence[str], replay: P
         yield f"devices answered what is not asked any more, left out: {listed(lost)}"
     yield from (f"FAILED {error}" for error in replay.errors)
     yield ""
-    yield from _scores(recording, graph, names, replay)
+    yield from _scores(recording, graph, replay)
     same = not any(effects[effect] for effect in DIFFERENT)
     counts = (f"{len(effects[effect])} {effect}" for effect in (*DIFFERENT, "identical") if effects[effect])
     yield f"{'NOTHING CHANGES' if same else 'CHANGED'}: {', '.join(counts) or 'no messages'}, of {len(names)} stages"
@@ -160,14 +160,14 @@ def _devices(graph: Graph, names: Collection[str], effects: Mapping[Effect, Sequ
 # ------------------------------------------------------------------------------------ the score
 
 
-def _scores(recording: Recording, graph: Graph, names: Collection[str], replay: PartialReplay) -> Iterator[str]:
+def _scores(recording: Recording, graph: Graph, replay: PartialReplay) -> Iterator[str]:
     """A table of what the graph's scorer says of both; a line where there is none."""
     if graph.score is None:
         yield "no score: the graph names none; valid: --set score=module:Class"
         return
     scorer: Scorer = graph.load("score", graph.score)
     before = scorer.score(_messages(change(recording), recording.envelopes()))
-    now = scorer.score(_messages(graph, _new_run(recording, names, replay)))
+    now = scorer.score(_messages(graph, _new_run(recording, replay)))
     rows = [_score_row(name, before.get(name), now.get(name)) for name in {**before, **now}]
     yield from table(("score", "recorded", "now", "change"), rows) or ["no score: the recording holds nothing to score"]
 
@@ -177,12 +177,10 @@ def _score_row(name: str, before: float | None, now: float | None) -> tuple[str,
     return name, *("-" if value is None else f"{value:.4g}" for value in (before, now)), change
 
 
-def _new_run(recording: Recording, names: Collection[str], replay: PartialReplay) -> Iterator[Envelope]:
+def _new_run(recording: Recording, replay: PartialReplay) -> Iterator[Envelope]:
     """Every message as it would have been: in the place of the recorded one, new ones at the end."""
-    for id in recording.messages:
-        sealed = replay.emitted.get(id) if MessageId.of(id).stage in names else replay.frozen.released.get(id)
-        if sealed is not None:
-            yield sealed
+    for id in filter(replay.frozen.came.__contains__, recording.messages):
+        yield replay.emitted[id] if id in replay.emitted else recording.envelope(id)
     yield from (sealed for id, sealed in replay.emitted.items() if id not in recording.messages)
 
 

@@ -37,7 +37,8 @@ def add_commands(commands: Commands) -> None:
 
 def _replay(options: argparse.Namespace) -> int:
     """Only saying what would be executed needs no clean process."""
-    travels = options.until or options.condition or options.step
+    places = [place for place in (options.until, options.condition) if place is not None]
+    travels = places or options.step
     changes = options.swaps or options.origins or (options.settings and not options.verify)
     if not (travels or changes or options.verify):
         from runner.replay.replay import plan
@@ -46,7 +47,7 @@ def _replay(options: argparse.Namespace) -> int:
         return 0
     if options.verify and travels:
         raise Refused("--verify goes through the whole recording; it does not stop with --until, --break or --step")
-    if options.until and options.condition:
+    if len(places) > 1:
         raise Refused("--until and --break each say where to stop; give one")
     if travels and options.origins:
         raise Refused(

@@ -37,6 +37,7 @@ def test_the_sign_of_zero_is_a_difference():
         (answer(1), answer(1, 2), "samples: recorded float64 (1,), replayed float64 (2,)"),
         ((1, 2), (1,), "recorded 2 items, replayed 1 items"),
         ({"a": 1}, {"b": 1}, "keys differ"),
+        ({"a": 1, 2: 1}, {"a": 1}, "recorded ['a', 2], replayed ['a'] (keys differ)"),
         ({"a": [1, {"b": 2}]}, {"a": [1, {"b": 3}]}, "['a'][1]['b']: recorded 2, replayed 3"),
         (None, 1, "types differ"),
         ("x" * 200, "y", "..."),

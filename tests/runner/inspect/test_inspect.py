@@ -1,6 +1,7 @@
 """Why, how long and what differs: the commands that look into a recording."""
 
 import random
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -18,8 +19,8 @@ from runner.inspect.latency import critical_paths, latency
 from runner.inspect.skipped import Skipped
 from runner.message.codec import Envelope, Step
 from runner.recording.recording import STEPS_ONLY, Recording
-from tests.runner.common.recordings import TOYS, record_toys, rewrite
-from tests.runner.common.runs import ALBUM
+from tests.runner.common.recordings import TOYS, record, record_toys, rewrite
+from tests.runner.common.runs import ALBUM, DOUBLES
 
 MS = 1_000_000
 COSTS = {"splitter": (1, 2, 10), "worker": (3, 4, 50), "gatherer": (5, 6, 20), "sink": (7, 8, 30)}
@@ -77,6 +78,20 @@ def test_without_a_journal_the_causes_in_the_header_are_shown(tmp_path: Path):
     path, _ = record_toys(tmp_path, keep=lambda record: None if isinstance(record, Step) else record)
     lines = list(Causes(Recording(path)).tree_of("splitter.piece#4"))
     assert lines == ["splitter.piece#4  Piece", "└─ counter.number#1  Number, the lineage starts here"]
+
+
+def test_a_long_chain_of_causes_is_shown_in_as_much_as_it_is_long(tmp_path: Path):
+    ids = [f"doubler.double#{number}" for number in range(5000)]
+    body = msgspec.Raw(msgspec.msgpack.encode({}))
+    chain = [Envelope(ids[0], ids[0], 0, "Double", 1, (), body)]
+    chain += [Envelope(id, ids[0], 0, "Double", 1, (before,), body) for before, id in pairwise(ids)]
+    graph = load_graph(DOUBLES, (f"sink.path={tmp_path}",))
+    causes = Causes(Recording(record(graph, tmp_path / "chain.mcap", chain)[0]))
+    lines = list(causes.tree_of(ids[-1]))
+    assert (len(lines), lines[1], lines[2]) == (5000, f"└─ {ids[-2]}  Double", f"   └─ {ids[-3]}  Double")
+    assert lines[-1].endswith(f"  └─ {ids[0]}  Double, the lineage starts here")
+    assert max(map(len, lines)) < 200
+    assert causes.path_to(ids[-1]) == ids
 
 
 # ------------------------------------------------------------------------------------ latency
@@ -159,6 +174,10 @@ def test_where_no_messages_were_recorded_none_are_compared_or_missed_and_steps_t
         assert capsys.readouterr() == ("", f"{path}: holds no messages (runner up --steps-only)\n")
     assert main(["info", str(path)]) == 0
     assert "lasted 0.00 ms" not in capsys.readouterr().out
+    said = latency(path)
+    edges = {line.partition("  ")[0] for line in said if " -> " in line}
+    assert edges == {"counter/number -> splitter.number", "gatherer/total -> sink.total"}
+    assert "left out: 25 steps that took several messages; no message is recorded that says which came last" in said
 
 
 # ------------------------------------------------------------------------------------ step by step

@@ -135,6 +135,21 @@ def test_gained_fields_are_not_compared_and_lost_ones_are():
     assert decode_untyped(lost.body) == {"x": 1, "inner": [{}]}
 
 
+class Sparse(Message, frozen=True, kw_only=True, omit_defaults=True):
+    """What leaves out fields that are as by default."""
+
+    x: int = 0
+    inner: Inner = Inner()
+
+
+def test_where_defaults_are_left_out_another_value_is_a_change():
+    old = envelope("Sparse", 1, inner={"y": 2})
+    new = without_gained_fields(old, envelope("Sparse", 1, x=5, inner={"y": 2, "w": 1}), Sparse)
+    assert decode_untyped(new.body) == {"x": 5, "inner": {"y": 2}}
+    same = without_gained_fields(old, envelope("Sparse", 1, inner={"y": 2, "w": 1}), Sparse)
+    assert bytes(same.body) == bytes(old.body)
+
+
 @pytest.mark.parametrize(
     "tags", [{"a": {"y": 1, "w": 0}, "b": {"y": 2}, "extra": {"y": 9}}, {"b": {"y": 2}, "a": {"y": 1}}, {"a": {"y": 1}}]
 )

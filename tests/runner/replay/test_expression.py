@@ -57,6 +57,7 @@ MESSAGES: dict[str, Message] = {
         "gatherer.total.last",
         "counter.number.value > 2 and max(worker.answer.samples) < 1",
         "(value := counter.number.value) and value == 3",
+        "max(ranker.scene.items, key=lambda item: item.cost).name == 'box'",
         "isinstance(counter.number, object)",
         "input.total.last",
     ],

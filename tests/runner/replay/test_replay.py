@@ -7,9 +7,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, Lost, Step, decode, envelope, pack, unpack
 from runner.recording.recording import Recording
-from tests.runner.common.recordings import record_toys, rewrite
+from runner.replay.replay import change
+from runner.replay.tasks import Comparison, Execution
+from tests.runner.common.recordings import ToyRun, record, record_toys, rewrite
 from tests.runner.common.toys import Answer
 
 TABLE = "tolerances=tests.runner.common.toys:TOLERANCES"
@@ -145,6 +148,48 @@ def test_each_incarnation_is_a_fresh_instance_that_goes_on_counting(tmp_path: Pa
     assert "gatherer after restart 1: 3 steps, 3 messages" in said
 
 
+@pytest.mark.parametrize(
+    ("recorded", "diverged"),
+    [
+        ("ValueError: limit 1 (odd.py:7 in on_number)", 0),
+        ("ValueError: limit 1", 0),
+        ("ValueError: limit 12 (odd.py:7 in on_number)", 1),
+        ("", 1),
+    ],
+)
+def test_an_error_is_the_same_where_all_of_it_is(toys: Path, recorded: str, diverged: int):
+    recording = Recording(toys)
+    comparison = Comparison(recording, change(recording).nodes["gatherer"], {})
+    step = Step("gatherer", 0, 0, 0, "on_answers", (), (), 0, 0, 0, 0, "failed", recorded)
+    comparison.add(Execution(step, error="ValueError: limit 1"))
+    assert comparison.result.diverged == diverged
+
+
+@pytest.mark.parametrize(("journalled", "said_so"), [(4, "44 of 45 messages of 3"), (0, "40 of 45 messages of 3")])
+def test_what_no_step_has_emitted_is_said_not_to_be_compared(tmp_path: Path, journalled: int, said_so: str):
+    """As if the gatherer had been killed after it had sent a total and before its step was journalled."""
+
+    def before(record: Envelope | Step) -> Envelope | Step | None:
+        late = isinstance(record, Step) and record.stage == "gatherer" and record.number >= journalled
+        return None if late else record
+
+    path, verdict = record_toys(tmp_path, keep=before, more=[Lost("gatherer", 0, 0, "killed", 0)])
+    assert verdict.complete, verdict
+    code, said = verify(path)
+    assert code == 0, said
+    assert f"IDENTICAL: {said_so} stages; of no step that was done: gatherer.total#{journalled}" in said
+
+
+def test_where_nothing_is_compared_nothing_is_verified(tmp_path: Path):
+    file = tmp_path / "alone.yaml"
+    file.write_text("name: alone\nstages: {counter: {stage: tests.runner.common.toys:Counter}}")
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "alone.mcap", ToyRun(graph, tmp_path).records())
+    code, said = verify(path)
+    assert code == 1
+    assert "NOT VERIFIED: 0 of 0 messages compared, none differs; COMPLETE" in said
+
+
 def test_a_setting_that_does_not_exist_is_refused(toys: Path):
     code, said = verify(toys, "worker.wrong=0")
     assert code == 2
@@ -252,3 +297,13 @@ def test_any_number_of_workers_gives_the_same_bytes(toys: Path, workers: int):
     code, said = verify(toys, workers=workers)
     assert code == 0, said
     assert "IDENTICAL: 45 messages of 3 stages" in said
+
+
+@pytest.mark.parametrize(("then", "now"), [(2, 1), (1, 2)])
+def test_another_number_of_replicas_gives_the_same_ids(tmp_path: Path, then: int, now: int):
+    path, _ = record_toys(tmp_path, f"worker.replicas={then}")
+    code, said = verify(path, f"worker.replicas={now}")
+    assert code == 0, said
+    assert "IDENTICAL: 45 messages of 3 stages" in said
+    _, said = replay(path, "--until", "worker.answer#7", "--set", f"worker.replicas={now}")
+    assert "executed again: identical to the recording" in said

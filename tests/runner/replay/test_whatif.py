@@ -1,23 +1,41 @@
 """Changed stages of recordings executed again, as a user types it."""
 
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from runner.cli.main import main
-from runner.contract import Context, Message, Stage
+from runner.contract import Context, Message, Refused, Stage
 from runner.graph.reading import load_graph
-from runner.message.codec import Envelope, Step, decode
+from runner.message.codec import Envelope, Step, decode, envelope
 from runner.process.forks import clean_environment
+from runner.process.inbox import Ready
+from runner.process.step import Executor, receive
 from runner.recording.recording import Recording
 from tests.runner.common import toys as toy_stages
 from tests.runner.common.recordings import ToyRun, record, record_toys
-from tests.runner.common.toys import Answer, Doubler, Gatherer, Number, Piece, Total, Worker
+from tests.runner.common.runs import ACCOUNT, TOYS
+from tests.runner.common.toys import (
+    Account,
+    Add,
+    Answer,
+    Doubler,
+    Gatherer,
+    Number,
+    Piece,
+    Splitter,
+    Sum,
+    Total,
+    Worker,
+)
 from tests.runner.replay.test_replay import replay
 
 DOUBLES = """
@@ -44,6 +62,44 @@ stages:
   worker: {{stage: "{__name__}:Uneven", replicas: 2, inputs: {{piece: splitter.piece, number: counter.number}}}}
   diary: {{stage: "{__name__}:Diary", inputs: {{answer: worker.answer}}}}
 """
+
+
+ALBUM = f"""
+name: album
+stages:
+  camera: {{stage: "{__name__}:Camera"}}
+  weigher: {{stage: "{__name__}:Weigher", inputs: {{picture: camera.picture}}}}
+"""
+
+
+MEASURED = """
+import resource, subprocess, sys
+subprocess.run(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+"""
+"""A program that runs another and says how much memory that held at most, beginning with little itself."""
+
+
+class Picture(Message, frozen=True):
+    """A megabyte."""
+
+    pixels: bytes
+
+
+class Camera(Stage):
+    """Takes 150 pictures."""
+
+    device = True
+
+    def source(self) -> Iterator[Picture]:
+        return (Picture(pixels=bytes(2**20)) for _ in range(150))
+
+
+class Weigher(Stage):
+    """Says how large pictures are."""
+
+    def on_picture(self, picture: Picture) -> "Told":
+        return Told(text=str(len(picture.pixels)))
 
 
 class Told(Message, frozen=True):
@@ -80,6 +136,20 @@ class Diary(Stage):
         return Told(text=str(self._seen))
 
 
+class Sparing(Splitter):
+    """Needs one part only for the fourth number."""
+
+    def on_number(self, number: Number) -> Iterator[Piece]:
+        return iter((Piece(index=0, count=1, value=3),)) if number.value == 3 else super().on_number(number)
+
+
+class Strict(Account):
+    """Adds nothing."""
+
+    def on_add(self, add: Add, ctx: Context) -> Sum:
+        raise Refused("closed")
+
+
 class Louder(Gatherer):
     """The same totals, twice as large."""
 
@@ -112,7 +182,7 @@ class Closing(Gatherer):
         Path(os.environ["CLOSED"]).touch()
 
 
-class Sum:
+class Grand:
     """Scores a toy run."""
 
     def __init__(self, settings: dict[str, object]) -> None:
@@ -191,6 +261,79 @@ def test_what_was_replaced_by_newer_ones_stays_so_between_stages_that_are_execut
     assert said.splitlines()[-1] == "NOTHING CHANGES: 8 identical, of 2 stages"
 
 
+class Ended(ToyRun):
+    """The graph ends while the fourth number is split: one of two parts is not worked on, and the fifth number left."""
+
+    def _worked_on(self, process: tuple[str, int], ready: Ready) -> Iterator[Envelope | Step]:
+        ids = {arrival.envelope.id for arrival in ready.arrivals}
+        left = ids & {"counter.number#4", "splitter.piece#13"}
+        return iter(()) if left else super()._worked_on(process, ready)
+
+    def _emitted(
+        self, process: tuple[str, int], handler: str, consumed: tuple[tuple[str, str], ...], out: list[Envelope]
+    ) -> Iterator[Envelope | Step]:
+        stopped = (process[0], *consumed) == ("splitter", ("number", "counter.number#3"))
+        for one in super()._emitted(process, handler, consumed, out[:2] if stopped else out):
+            yield msgspec.structs.replace(one, outcome="stopped") if stopped and isinstance(one, Step) else one
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ended")
+    graph = load_graph(TOYS, (f"sink.path={folder / 'out.txt'}",))
+    path, verdict = record(graph, folder / "ended.mcap", Ended(graph, folder).records())
+    assert verdict.complete, verdict
+    return path
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_what_was_stopped_and_left_when_the_graph_ended_stays_so(ended: Path, workers: str):
+    code, said = replay(ended, "--from", "splitter", "--workers", workers)
+    assert code == 0, said
+    assert said.splitlines()[-1] == "NOTHING CHANGES: 30 identical, of 3 stages"
+    _, said = replay(ended, "--set", "seed=8", "--workers", workers)
+    assert (row(said, "worker/answer"), row(said, "gatherer/total")) == (["-", "13", "-", "-"], ["-", "3", "-", "-"])
+    assert "appeared: " not in said
+
+
+def test_what_was_left_for_want_of_a_part_is_taken_where_it_is_wanted_no_more(ended: Path):
+    _, said = replay(ended, "--swap", "splitter=tests.runner.replay.test_whatif:Sparing")
+    assert row(said, "gatherer/total") == ["3", "-", "1", "-"]
+    assert "appeared: gatherer.total#3" in said
+
+
+def called(folder: Path, *amounts: int) -> Path:
+    """A recording of an account that was told to add these."""
+    graph = load_graph(ACCOUNT, ("counter.count=0",))
+    executor = Executor(graph.nodes["account"], Account(), seed=0, directory=folder, log=lambda *_: None)
+    (handler,) = (one for one in graph.nodes["account"].type.handlers if one.name == "on_add")
+    records: list[Envelope | Step] = []
+    for number, amount in enumerate(amounts):
+        id = f"supervisor.account_add#{number}"
+        add = envelope(Add(amount=amount), id=id, lineage=id, time_ns=number, causes=())
+        out, error = list[Envelope](), ""
+        try:
+            out += executor.run(handler, [receive(handler.inputs[0], add)], number)
+        except Refused as refusal:
+            error = f"Refused: {refusal}"
+        sent, taken = (Step(name, 0, 0, number, "", (), (), number, 0, 0, 0) for name in ("supervisor", "account"))
+        ids = tuple(sealed.id for sealed in out)
+        taken = msgspec.structs.replace(
+            taken, handler="on_add", consumed=(("add", id),), emitted=ids, outcome="done", error=error
+        )
+        records += [add, msgspec.structs.replace(sent, emitted=(id,)), *out, taken]
+    return record(graph, folder / "account.mcap", records)[0]
+
+
+def test_a_command_that_was_refused_then_as_well_is_no_failure(tmp_path: Path):
+    code, said = replay(called(tmp_path, 3, 0, 4), "--from", "account")
+    assert (code, said.splitlines()[-1]) == (0, "NOTHING CHANGES: 2 identical, of 1 stages"), said
+    assert "FAILED" not in said
+    code, said = replay(tmp_path / "account.mcap", "--swap", "account=tests.runner.replay.test_whatif:Strict")
+    assert code == 1
+    assert "FAILED account.on_add of supervisor.account_add#0: Refused: closed" in said
+
+
 def test_fewer_parts_gather_to_other_totals(toys: Path):
     code, said = replay(toys, "--set", "splitter.parts=3")
     assert code == 0, said
@@ -212,7 +355,7 @@ def test_more_parts_appear_with_the_ids_that_a_run_would_give(toys: Path, tmp_pa
 
 def test_a_swapped_class_changes_its_messages_by_how_much_and_the_score(toys: Path):
     swap = "gatherer=tests.runner.replay.test_whatif:Louder"
-    code, said = replay(toys, "--swap", swap, "--set", "score=tests.runner.replay.test_whatif:Sum")
+    code, said = replay(toys, "--swap", swap, "--set", "score=tests.runner.replay.test_whatif:Grand")
     assert code == 0, said
     assert "executed again: gatherer; as recorded: " in said
     assert row(said, "gatherer/total") == ["-", "5", "-", "-"]
@@ -267,6 +410,17 @@ def test_stages_are_closed_at_the_end(toys: Path, tmp_path: Path, monkeypatch: p
     code, said = replay(toys, "--swap", "gatherer=tests.runner.replay.test_whatif:Closing")
     assert code == 0, said
     assert (tmp_path / "closed").exists()
+
+
+def test_what_stays_as_recorded_is_not_held_in_memory(tmp_path: Path):
+    file = tmp_path / "album.yaml"
+    file.write_text(ALBUM)
+    graph = load_graph(file)
+    path, _ = record(graph, tmp_path / "album.mcap", ToyRun(graph, tmp_path).records())
+    command = (sys.executable, "-c", MEASURED, sys.executable, "-m", "runner.cli", "replay", path, "--from", "weigher")
+    *_, said, kilobytes = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert said == "NOTHING CHANGES: 150 identical, of 1 stages"
+    assert int(kilobytes) < 130 * 1024
 
 
 def test_another_seed_executes_everything(toys: Path):
