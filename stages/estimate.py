@@ -16,7 +16,7 @@ from runner.contract import Context, Level, Message, Refused
 from stages.appraiser import Appraiser
 from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
-from stages.geometry.camera import checked_intrinsics
+from stages.geometry.camera import checked_depth, checked_intrinsics
 from stages.geometry.lens import Lens
 from stages.hypotheses import Hypotheses
 from stages.messages import (
@@ -239,11 +239,11 @@ def _frame(rgb: NDArray[np.uint8], depth: NDArray[np.floating[Any]], K: Floats, 
     if np.shape(K) != (3, 3):
         raise Refused(f"K is {np.shape(K)}; 3 x 3 is expected")
     try:
-        checked = checked_intrinsics(np.array(K, float))
+        metres, pinhole = checked_depth(np.ascontiguousarray(depth, np.float32)), checked_intrinsics(np.array(K, float))
     except ValueError as error:
         raise Refused(str(error)) from None
     return Frame(
-        rgb=np.ascontiguousarray(rgb), depth=np.ascontiguousarray(depth, np.float32), K=checked,
+        rgb=np.ascontiguousarray(rgb), depth=metres, K=pinhole,
         T_base_camera=None if T_base_camera is None else np.array(T_base_camera, float), robot_mask=None,
         name="image", index=0, total=1,
     )  # fmt: skip

@@ -104,6 +104,8 @@ def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
         estimate_scene(RGB / 255, depth, K, CATALOGUE_FILE, boxes=given)  # type: ignore[arg-type]
     with pytest.raises(Refused, match=r"depth is uint16 .* of floats, metres, is expected"):
         estimate_scene(RGB, (1000 * depth).astype(np.uint16), K, CATALOGUE_FILE, boxes=given)  # type: ignore[arg-type]
+    with pytest.raises(Refused, match=r"median depth is 7\d\d\..* m; metres are expected, 0\.05 to 20"):
+        estimate_scene(RGB, 1000 * depth, K, CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match=r"K is \(4,\); 3 x 3 is expected"):
         estimate_scene(RGB, depth, np.zeros(4), CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match=r"K = .*: must be fx 0 cx, .* without skew"):
