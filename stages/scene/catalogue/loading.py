@@ -46,36 +46,76 @@ def written_link(path: Path) -> Path | None:
 
 
 def read_mesh(path: Path, scale: float) -> Mesh:
-    """A mesh of any format that trimesh reads; ``scale`` turns its lengths into metres.
+    """A mesh of any format that trimesh reads; ``scale`` turns its lengths into metres. Vertices are its triangles'.
 
     Raises:
-        Refused: the file is missing, unreadable or has no triangles.
+        Refused: the file is missing, unreadable or has no triangles, or a file that it names is missing.
     """
     if not path.is_file():
         raise Refused(f"{path}: no such mesh file")
-    return read_plain_ply(path, scale) or _read_any(path, scale)
+    return _of_triangles(read_plain_ply(path, scale) or _read_any(path, scale))
+
+
+def _of_triangles(mesh: Mesh) -> Mesh:
+    used = np.zeros(len(mesh.vertices), np.bool_)
+    used[mesh.faces] = True
+    if used.all():
+        return mesh
+    number = (np.cumsum(used) - 1).astype(np.int32)
+    return Mesh(mesh.vertices[used], number[mesh.faces], mesh.colors[used])
 
 
 def _read_any(path: Path, scale: float) -> Mesh:
     # Loading it takes 0.4 s, which every stage that has a catalogue would wait for at its start.
     import trimesh
 
+    named = _named_files(path)
     try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        loaded: Any = trimesh.load(path, force="mesh", process=False, resolver=named)
     except Exception as error:  # trimesh raises whatever its format readers raise
         formats = ", ".join(sorted(trimesh.available_formats()))
         raise Refused(f"{path}: not a readable mesh ({error}); formats are {formats}") from error
+    if named.missing:
+        raise Refused(
+            f"{path}: its material or texture {', '.join(named.missing)} is missing; paths are from its folder"
+        )
     vertices = scale * np.asarray(getattr(loaded, "vertices", ()), np.float64)
-    if len(vertices) == 0 or len(loaded.faces) == 0 or not np.isfinite(vertices).all():
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int32)
+    inside = len(faces) > 0 and faces.min() >= 0 and faces.max() < len(vertices)
+    if not inside or not np.isfinite(vertices).all():
         raise Refused(f"{path}: a mesh with triangles and finite coordinates is expected")
-    return Mesh(vertices=vertices, faces=np.asarray(loaded.faces, np.int32), colors=_vertex_colors(loaded))
+    return Mesh(vertices=vertices, faces=faces, colors=_vertex_colors(loaded))
+
+
+def _named_files(path: Path) -> Any:
+    """Finds what a mesh file names, and keeps what is ``missing``: trimesh goes on without it."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Files(FilePathResolver):
+        missing: tuple[str, ...] = ()
+
+        def get(self, name: str) -> Any:
+            try:
+                return super().get(name)
+            except OSError:
+                self.missing += (name.strip(),)
+                raise
+
+    return Files(str(path), allow_anywhere=True)
 
 
 def _vertex_colors(loaded: Any) -> Any:
-    if loaded.visual.kind is None:
-        return np.tile(np.array(_GREY, np.uint8), (len(loaded.vertices), 1))
-    visual = loaded.visual.to_color() if loaded.visual.kind == "texture" else loaded.visual
-    return np.ascontiguousarray(np.asarray(visual.vertex_colors, np.uint8)[:, :3])
+    visual = loaded.visual
+    if visual.kind is None:
+        colors: Any = _GREY
+    elif visual.kind == "texture":
+        # Without a texture None or one colour.
+        colors = visual.material.to_color(visual.uv)
+        colors = visual.material.main_color if colors is None else colors
+    else:
+        colors = visual.vertex_colors
+    each = np.broadcast_to(np.asarray(colors, np.uint8)[..., :3], (len(loaded.vertices), 3))
+    return np.ascontiguousarray(each)
 
 
 # --- YAML -------------------------------------------------------------------------------------------------------

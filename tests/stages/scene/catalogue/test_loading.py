@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.exchange.ply import export_ply
 
 from runner.contract import Refused
 from stages.scene.catalogue import Catalogue
@@ -153,9 +155,55 @@ def test_unreadable_mesh_is_refused_with_the_formats(folder: Path) -> None:
 
 def test_textured_mesh_gets_vertex_colours(folder: Path) -> None:
     box = trimesh.creation.box(BOX)
-    from PIL import Image
-
     texture = Image.new("RGB", (4, 4), (200, 10, 20))
     box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), image=texture)
     box.export(folder / "painted.glb")
     assert (load(folder, mesh("painted.glb"))["jar"].mesh.colors == (200, 10, 20)).all()
+
+
+PAINTED = "".join(f"v {corner}\n" for corner in ("0 0 0", "9 0 0", "0 9 0", "0 0 9")) + "vt 0 0\nusemtl paint\n"
+PAINTED += "".join(f"f {a}/1 {b}/1 {c}/1\n" for a, b, c in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4)))
+
+
+def test_a_mesh_whose_material_or_texture_is_missing_is_refused(folder: Path) -> None:
+    (folder / "painted.obj").write_text("mtllib painted.mtl\n" + PAINTED)
+    with pytest.raises(
+        Refused, match=r":3: .*mesh\.file: .*painted\.obj: its material or texture painted\.mtl is missing"
+    ):
+        load(folder, mesh("painted.obj"))
+    (folder / "painted.mtl").write_text("newmtl paint\nKd 0.8 0.1 0.1\nmap_Kd paint.png\n")
+    with pytest.raises(Refused, match=r"painted\.obj: its material or texture paint\.png is missing"):
+        load(folder, mesh("painted.obj"))
+    whole = trimesh.creation.box(BOX)
+    whole.visual = trimesh.visual.TextureVisuals(uv=np.full((len(whole.vertices), 2), 0.5))
+    header, _, body = export_ply(whole, encoding="ascii").partition(b"element vertex")
+    (folder / "painted.ply").write_bytes(header + b"comment TextureFile paint.png\nelement vertex" + body)
+    with pytest.raises(Refused, match=r"painted\.ply: its material or texture paint\.png is missing"):
+        load(folder, mesh("painted.ply"))
+
+
+def test_a_texture_may_lie_in_another_folder_and_a_material_may_have_none(folder: Path) -> None:
+    (folder / "meshes").mkdir()
+    (folder / "meshes" / "painted.obj").write_text("mtllib painted.mtl\n" + PAINTED)
+    for line, color in (("", (204, 26, 26)), ("map_Kd ../paint.png\n", (200, 10, 20))):
+        (folder / "meshes" / "painted.mtl").write_text(f"newmtl paint\nKd 0.8 0.1 0.1\n{line}")
+        Image.new("RGB", (4, 4), (200, 10, 20)).save(folder / "paint.png")
+        assert (load(folder, mesh("meshes/painted.obj"))["jar"].mesh.colors == color).all()
+    box = trimesh.creation.box(BOX)
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[200, 10, 20, 255])
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), material=material)
+    box.export(folder / "painted.glb")
+    assert (load(folder, mesh("painted.glb"))["jar"].mesh.colors == (200, 10, 20)).all()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+@pytest.mark.parametrize("color", [None, (200, 10, 20, 255)])
+def test_a_vertex_of_no_triangle_does_not_count(folder: Path, suffix: str, color: tuple[int, ...] | None) -> None:
+    box = trimesh.creation.box(BOX)
+    colors = None if color is None else [(0, 0, 0, 255), *[color] * len(box.vertices)]
+    vertices, faces = np.vstack([[500.0, 500, 500], box.vertices]), box.faces + 1
+    trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False).export(folder / f"far.{suffix}")
+    jar = load(folder, mesh(f"far.{suffix}"))["jar"]
+    np.testing.assert_allclose(jar.dimensions, [0.06, 0.08, 0.10], atol=1e-6)
+    np.testing.assert_allclose(jar.mesh.vertices[jar.mesh.faces], 0.01 * box.triangles, atol=1e-6)
+    assert color is None or (jar.mesh.colors == color[:3]).all()
