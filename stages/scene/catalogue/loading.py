@@ -15,11 +15,15 @@ from stages.scene.catalogue.properties import enclosing_box, read_collision, rea
 from stages.scene.catalogue.sections import Section, read_section
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+SMALLEST, LARGEST = 0.005, 3.0
+"""Metres that the longest side of an object's enclosing box has."""
 FRICTION = 0.8
 _GREY = (170, 170, 170)
 _SPECIFIC_MASS = 300.0
 """Kilogrammes per cubic metre of the enclosing box: typical of packaged food and crockery."""
 _LONGEST_PATH = 4096
+_FLAT = 1e-5
+"""Metres below which something has no thickness."""
 _SYMMETRY_KEYS = ("symmetries_discrete", "symmetries_continuous", "near_symmetries_discrete")
 
 
@@ -150,11 +154,28 @@ def _yaml_object(section: Section, name: str, position: int) -> CatalogueObject:
 
 def _yaml_mesh(section: Section) -> Mesh:
     section.only("file", "unit")
-    scale = UNITS[section.choice("unit", tuple(UNITS))]
+    unit, file = section.choice("unit", tuple(UNITS)), section.text("file")
     try:
-        return read_mesh(section.file.parent / section.text("file"), scale)
+        mesh = read_mesh(section.file.parent / file, UNITS[unit])
     except Refused as error:
         section.refuse(str(error), "file")
+    return _solid(mesh, section, file, unit)
+
+
+def _solid(mesh: Mesh, section: Section, file: str, unit: str) -> Mesh:
+    """The mesh, which is as large as what stands on tables, and has a volume."""
+    middle = mesh.vertices - mesh.vertices.mean(0)
+    # The last axis is the one along which it is thinnest.
+    thickness = np.ptp(middle @ np.linalg.svd(middle.T @ middle)[0][:, 2])
+    length = float(np.ptp(mesh.vertices, axis=0).max())
+    if not SMALLEST <= length <= LARGEST:
+        other = {name: length / UNITS[unit] * scale for name, scale in UNITS.items()}
+        meant = [f"{name} ({size:.2g} m)" for name, size in other.items() if SMALLEST <= size <= LARGEST]
+        asked = f"; is {' or '.join(meant)} meant?" if meant else ""
+        section.refuse(f"{file} in {unit} is {length:.4g} m long; {SMALLEST:g} to {LARGEST:g} m are expected{asked}")
+    if thickness < _FLAT:
+        section.refuse(f"{file} is flat; an object has a volume")
+    return mesh
 
 
 def _refuse_equal_labels(listing: Section, objects: dict[str, CatalogueObject]) -> None:
@@ -189,7 +210,7 @@ def _read_bop(info: Path) -> dict[str, CatalogueObject]:
 def _bop_object(section: Section, label: int) -> CatalogueObject:
     # Data sets add keys of their own; only what is used is checked.
     file = f"obj_{label:06d}"
-    mesh = read_mesh(section.file.parent / f"{file}.ply", UNITS["mm"])
+    mesh = _solid(read_mesh(section.file.parent / f"{file}.ply", UNITS["mm"]), section, f"{file}.ply", "mm")
     return CatalogueObject(
         name=section.text("name", file),
         label=label,

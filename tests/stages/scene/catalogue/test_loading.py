@@ -44,7 +44,8 @@ def test_any_format_loads_with_defaults(folder: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("inch", 0.0254)])
 def test_units(folder: Path, unit: str, scale: float) -> None:
-    np.testing.assert_allclose(load(folder, mesh(unit=unit))["jar"].dimensions, np.array(BOX) * scale, rtol=1e-6)
+    trimesh.creation.box(0.01 * np.array(BOX) / scale).export(folder / "box.ply")
+    np.testing.assert_allclose(load(folder, mesh(unit=unit))["jar"].dimensions, 0.01 * np.array(BOX), rtol=1e-6)
 
 
 def test_shorthands_expand(folder: Path) -> None:
@@ -133,6 +134,40 @@ def test_bop_folder_with_a_missing_mesh_is_refused(tmp_path: Path) -> None:
     (tmp_path / "models_info.json").write_text('{"3": {}}')
     with pytest.raises(Refused, match=r"obj_000003\.ply: no such mesh file"):
         Catalogue.load(tmp_path)
+
+
+def test_a_mesh_of_another_unit_is_refused(folder: Path) -> None:
+    says = r"box\.ply in m is 10 m long; 0\.005 to 3 m are expected; is cm \(0\.1 m\) or mm .* or inch .* meant\?"
+    with pytest.raises(Refused, match=r":3: objects\.jar\.mesh: " + says):
+        load(folder, mesh(unit="m"))
+
+
+def test_a_mesh_that_is_large_or_small_in_every_unit_is_refused(folder: Path) -> None:
+    for scale, says in (
+        (1e6, r"1e\+04 m long; 0\.005 to 3 m are expected$"),
+        (1e-3, r"1e-05 m long; .*; is m \(0\.01 m\)"),
+    ):
+        trimesh.creation.box(np.array(BOX) * scale).export(folder / "odd.ply")
+        with pytest.raises(Refused, match=says):
+            load(folder, mesh("odd.ply", "mm"))
+
+
+def test_a_bop_model_in_metres_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "models_info.json").write_text('{"3": {}}')
+    trimesh.creation.box([0.1, 0.1, 0.2]).export(tmp_path / "obj_000003.ply")
+    with pytest.raises(
+        Refused, match=r"models_info\.json:1: 3: obj_000003\.ply in mm is 0\.0002 m long; .* is m \(0\.2 m\)"
+    ):
+        Catalogue.load(tmp_path)
+
+
+@pytest.mark.parametrize("more", ["", "    mass: 1\n    resting: [upright]\n"])
+def test_a_flat_mesh_is_refused(folder: Path, more: str) -> None:
+    flat = trimesh.creation.box([9, 9, 0])
+    flat.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    flat.export(folder / "flat.ply")
+    with pytest.raises(Refused, match=r":3: objects\.jar\.mesh: flat\.ply is flat; an object has a volume"):
+        load(folder, mesh("flat.ply") + more)
 
 
 def test_a_link_that_git_wrote_as_a_file_is_followed(tmp_path: Path) -> None:
