@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from stages.scene.catalogue.objects import CatalogueObject, Mesh
 from stages.scene.catalogue.ply import read_plain_ply
 from stages.scene.catalogue.properties import enclosing_box, read_collision, read_grasps, read_resting, read_symmetries
 from stages.scene.catalogue.sections import Section, read_section
+from stages.scene.domain import TABLE, symbol
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 SMALLEST, LARGEST = 0.005, 3.0
@@ -122,6 +124,19 @@ def _vertex_colors(loaded: Any) -> Any:
     return np.ascontiguousarray(each)
 
 
+def _refuse_unfit_names(section: Section, names: Iterable[tuple[str, str]]) -> None:
+    """Names (key, name) by which people and goals, which are PDDL, could not tell objects from each other."""
+    owners = {TABLE: "the table itself"}
+    for key, name in names:
+        if not name.strip():
+            section.refuse(f"{name!r} is no name of an object", key)
+        written = symbol(name)
+        if written in owners:
+            other = f"'{name}' and {owners[written]} are both '{written}' in goals"
+            section.refuse(f"{other}; names differ in letters a to z, digits, - or _", key)
+        owners[written] = f"'{name}'"
+
+
 # --- YAML -------------------------------------------------------------------------------------------------------
 
 
@@ -129,6 +144,7 @@ def _read_yaml(path: Path) -> dict[str, CatalogueObject]:
     root = read_section(path)
     root.only("objects")
     listing = root.section("objects")
+    _refuse_unfit_names(listing, [(name, name) for name in listing.values])
     objects = {name: _yaml_object(listing.section(name), name, index) for index, name in enumerate(listing.values, 1)}
     _refuse_equal_labels(listing, objects)
     return objects
@@ -200,11 +216,9 @@ def _read_bop(info: Path) -> dict[str, CatalogueObject]:
     for key in root.values:
         if not key.isdecimal():
             root.refuse("keys of models_info.json are object numbers", key)
-        item = _bop_object(root.section(key), int(key))
-        if item.name in objects:
-            root.refuse(f"the name '{item.name}' stands there twice; names are unique", key)
-        objects[item.name] = item
-    return objects
+        objects[key] = _bop_object(root.section(key), int(key))
+    _refuse_unfit_names(root, [(key, item.name) for key, item in objects.items()])
+    return {item.name: item for item in objects.values()}
 
 
 def _bop_object(section: Section, label: int) -> CatalogueObject:

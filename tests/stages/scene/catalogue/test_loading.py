@@ -120,6 +120,39 @@ def test_mistakes_are_refused_in_one_line(folder: Path, body: str, message: str)
     assert "\n" not in str(refusal.value)
 
 
+NAMES = [
+    (
+        ["table"],
+        r":2: objects\.table: 'table' and the table itself are both 'table' in goals; names differ in letters a to z",
+    ),
+    (["Table"], r":2: objects\.Table: 'Table' and the table itself are both 'table' in goals"),
+    (["cup", "jam jar", "jam_jar"], r":6: objects\.jam_jar: 'jam_jar' and 'jam jar' are both 'jam_jar' in goals"),
+    (["чашка", "ложка"], r":4: objects\.ложка: 'ложка' and 'чашка' are both 'o______' in goals"),
+    ([""], r":2: objects: '' is no name of an object"),
+    (["cup", "  "], r":4: objects\.  : '  ' is no name of an object"),
+]
+
+
+@pytest.mark.parametrize(("names", "message"), NAMES)
+def test_names_that_goals_cannot_tell_apart_are_refused(folder: Path, names: list[str], message: str) -> None:
+    file = folder / "catalogue.yaml"
+    file.write_text("objects:\n" + "".join(f'  "{name}":\n{mesh()}' for name in names), encoding="utf-8")
+    with pytest.raises(Refused, match=message):
+        Catalogue.load(file)
+
+
+def test_names_of_bop_models_are_checked_alike(folder: Path) -> None:
+    trimesh.creation.box([60, 80, 100]).export(folder / "obj_000001.ply")
+    trimesh.creation.box([60, 80, 100]).export(folder / "obj_000002.ply")
+    for one, other, message in (
+        ("jar", "jar", r":1: 2: 'jar' and 'jar' are both 'jar' in goals"),
+        ("024_bowl", "table", r":1: 2: 'table' and the table itself are both 'table' in goals"),
+    ):
+        (folder / "models_info.json").write_text(f'{{"1": {{"name": "{one}"}}, "2": {{"name": "{other}"}}}}')
+        with pytest.raises(Refused, match=message):
+            Catalogue.load(folder)
+
+
 def test_missing_catalogue_is_refused(tmp_path: Path) -> None:
     with pytest.raises(Refused, match=r"nothing\.yaml: no such catalogue"):
         Catalogue.load(tmp_path / "nothing.yaml")
