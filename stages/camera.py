@@ -13,8 +13,8 @@ import numpy as np
 from runner.contract import Context, Refused, Stage
 from stages.devices.ros2.settings import Distribution, Link, Patience, Source
 from stages.geometry.arrays import Floats
+from stages.geometry.camera import checked_camera_pose
 from stages.geometry.lens import INVERSE, PLUMB_BOB, Lens
-from stages.geometry.poses import is_pose
 from stages.hand_eye.board import Board
 from stages.messages import Frame, LookRequest, Snapshot
 from stages.perception.rendering.depth_noise import color_noise, structured_light
@@ -280,13 +280,13 @@ def _camera_pose(numbers: tuple[float, ...]) -> Floats | None:
     """The setting as a 4 x 4 matrix; None where there is none.
 
     Raises:
-        Refused: it is no pose.
+        Refused: it is no pose, or not in metres.
     """
     if not numbers:
         return None
     if len(numbers) != 16:
         raise Refused(f"camera.T_base_camera has {len(numbers)} numbers; a pose is 16, row by row")
-    T = np.reshape(numbers, (4, 4))
-    if not is_pose(T):
-        raise Refused(f"camera.T_base_camera: {T.tolist()} is no pose; a rotation and metres above 0 0 0 1 are")
-    return T
+    try:
+        return checked_camera_pose(np.reshape(numbers, (4, 4)))
+    except ValueError as error:
+        raise Refused(f"camera.T_base_camera: {error}") from None

@@ -16,7 +16,7 @@ from runner.contract import Context, Level, Message, Refused
 from stages.appraiser import Appraiser
 from stages.detector import Detector, ModelDetector
 from stages.geometry.arrays import Floats
-from stages.geometry.camera import checked_intrinsics
+from stages.geometry.camera import checked_camera_pose, checked_depth, checked_intrinsics
 from stages.geometry.lens import Lens
 from stages.hypotheses import Hypotheses
 from stages.messages import (
@@ -232,19 +232,23 @@ def _network(catalogue: Path) -> Detector:
 
 
 def _frame(rgb: NDArray[np.uint8], depth: NDArray[np.floating[Any]], K: Floats, T_base_camera: Floats | None) -> Frame:
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-        raise Refused(f"rgb is {rgb.dtype} {rgb.shape}; H x W x 3 of uint8 is expected")
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.size == 0:
+        raise Refused(f"rgb is {rgb.dtype} {rgb.shape}; H x W x 3 of uint8 is expected, of a pixel or more")
     if depth.shape != rgb.shape[:2] or not np.issubdtype(depth.dtype, np.floating):
         raise Refused(f"depth is {depth.dtype} {depth.shape}; {rgb.shape[:2]} of floats, metres, is expected")
     if np.shape(K) != (3, 3):
         raise Refused(f"K is {np.shape(K)}; 3 x 3 is expected")
     try:
-        checked = checked_intrinsics(np.array(K, float))
+        metres, pinhole = checked_depth(np.ascontiguousarray(depth, np.float32)), checked_intrinsics(np.array(K, float))
     except ValueError as error:
         raise Refused(str(error)) from None
+    try:
+        placed = None if T_base_camera is None else checked_camera_pose(np.array(T_base_camera, float))
+    except ValueError as error:
+        raise Refused(f"T_base_camera: {error}") from None
     return Frame(
-        rgb=np.ascontiguousarray(rgb), depth=np.ascontiguousarray(depth, np.float32), K=checked,
-        T_base_camera=None if T_base_camera is None else np.array(T_base_camera, float), robot_mask=None,
+        rgb=np.ascontiguousarray(rgb), depth=metres, K=pinhole,
+        T_base_camera=placed, robot_mask=None,
         name="image", index=0, total=1,
     )  # fmt: skip
 
@@ -269,7 +273,10 @@ def _candidates(boxes: Sequence[Box], catalogue: Catalogue) -> Candidates:
     labels = tuple(dict.fromkeys(item.label for item in found))
     confidences = np.zeros((len(found), len(labels)))
     for row, item in zip(confidences, found, strict=True):
-        if item.box.shape != (4,) or (item.box[2:] <= item.box[:2]).any():
+        finite = item.box.shape == (4,) and np.isfinite(item.box).all()
+        if not finite or (item.box[2:] <= item.box[:2]).any():
             raise Refused(f"box of {item.label}: {item.box.tolist()} is not x0, y0, x1, y1 with x0 < x1 and y0 < y1")
+        if not 0 <= item.confidence <= 1:
+            raise Refused(f"box of {item.label}: confidence {item.confidence:g} must lie from 0 to 1")
         row[labels.index(item.label)] = item.confidence
     return Candidates(candidates=tuple(found), labels=labels, confidences=confidences)

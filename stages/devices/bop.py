@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from runner.contract import Refused
-from stages.geometry.camera import checked_intrinsics
+from stages.geometry.camera import checked_depth, checked_intrinsics
 from stages.messages.arrays import Depth, Intrinsics, Rgb
 
 TARGETS = "test_targets_bop19.json"
 _COLOR_SUFFIXES = (".png", ".jpg")
+_DEPTH_MODES = ("I;16", "I;16B", "I")
+"""Pillow's, of one channel of 16 or 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,14 @@ class BopImage:
         """Colour (H x W x 3) and depth (H x W, metres, 0 = no reading).
 
         Raises:
-            Refused: a file cannot be decoded.
+            Refused: a file cannot be decoded, or depth cannot be metres.
         """
         rgb = np.ascontiguousarray(_pixels(self.rgb, "RGB"), np.uint8)
         millimetres = _pixels(self.depth).astype(np.float64) * self.depth_scale
-        return rgb, (millimetres / 1000.0).astype(np.float32)
+        try:
+            return rgb, checked_depth((millimetres / 1000.0).astype(np.float32))
+        except ValueError as error:
+            raise Refused(f"{self.depth}: {error}; a unit is depth_scale = {self.depth_scale:g} millimetres") from None
 
 
 class _Target(msgspec.Struct, frozen=True):
@@ -64,7 +69,8 @@ def read_dataset(dataset: Path) -> list[BopImage]:
     """Every image of the data set's targets, in the order of the file.
 
     Raises:
-        Refused: a file is missing or malformed, or colour and depth differ in size; names file, image and key.
+        Refused: a file is missing or malformed, colour and depth differ in size, or depth is not of 16 bits; names
+            file, image and key.
     """
     if not dataset.is_dir():
         raise Refused(f"{dataset}: no such data set folder; it holds {TARGETS}, test/ and models/")
@@ -90,8 +96,11 @@ def _image(dataset: Path, key: tuple[int, int], n_objects: int, cameras: dict[st
     name = f"{image_id:06d}"
     rgb = _existing((scene / "rgb" / f"{name}{suffix}" for suffix in _COLOR_SUFFIXES), "colour")
     depth = _existing([scene / "depth" / f"{name}.png"], "depth")
-    if _size(rgb) != _size(depth):
-        raise Refused(f"{depth}: {_shown(_size(depth))} pixels, but the colour image has {_shown(_size(rgb))}")
+    (size, mode), (wanted, _) = _header(depth), _header(rgb)
+    if size != wanted:
+        raise Refused(f"{depth}: {_shown(size)} pixels, but the colour image has {_shown(wanted)}")
+    if mode not in _DEPTH_MODES:
+        raise Refused(f"{depth}: an image of mode {mode}; depth is one channel of 16 bits ({', '.join(_DEPTH_MODES)})")
     try:
         K = checked_intrinsics(np.array(view.cam_K, np.float64).reshape(3, 3))
     except ValueError as error:
@@ -125,11 +134,11 @@ def _decoded(file: Path, kind: Any) -> Any:
         raise Refused(f"{file}: {error}") from None
 
 
-def _size(file: Path) -> tuple[int, int]:
-    """Width and height, from the header."""
+def _header(file: Path) -> tuple[tuple[int, int], str]:
+    """Width and height, and Pillow's mode."""
     try:
         with Image.open(file) as image:
-            return image.size
+            return image.size, image.mode
     except (OSError, UnidentifiedImageError) as error:
         _unreadable(file, error)
 

@@ -8,10 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from stages.geometry.arrays import Floats
-from stages.messages.arrays import Depth, Intrinsics
+from stages.geometry.poses import is_pose
+from stages.messages.arrays import Depth, Intrinsics, Pose
 
 _SKEWED = 1e-3
 """Pixels by which an entry of K may be off where a pinhole camera has 0 or 1."""
+_AWAY = 100.0
+"""Metres from the base beyond which a camera is said to be in millimetres."""
+_NEAREST, _FARTHEST = 0.05, 20.0
+"""Metres between which the median reading of what looks at a table lies."""
 
 
 def intrinsics(focal: float, width: int, height: int) -> Intrinsics:
@@ -29,6 +34,31 @@ def checked_intrinsics(K: Floats) -> Intrinsics:
     if not (np.abs(K - pinhole).max() < _SKEWED and pinhole.diagonal().min() > 0):
         raise ValueError(f"K = {K.tolist()}: must be fx 0 cx, 0 fy cy, 0 0 1 with fx and fy above 0 and without skew")
     return K
+
+
+def checked_camera_pose(T: Floats) -> Pose:
+    """T_base_camera (4 x 4) as it is given.
+
+    Raises:
+        ValueError: it is no pose, or cannot be metres.
+    """
+    if T.shape != (4, 4) or not is_pose(T):
+        raise ValueError(f"{T.tolist()} is no pose; 4 x 4, a rotation and metres above 0 0 0 1, is")
+    if (away := float(np.linalg.norm(T[:3, 3]))) > _AWAY:
+        raise ValueError(f"the camera is {away:g} m away; metres are expected, {_AWAY:g} at most")
+    return T
+
+
+def checked_depth(depth: Depth) -> Depth:
+    """Depth (H x W) as it is given; where it is 0 or not finite there is no reading.
+
+    Raises:
+        ValueError: it cannot be metres.
+    """
+    readings = depth[np.isfinite(depth) & (depth > 0)]
+    if len(readings) and not _NEAREST <= (median := float(np.median(readings))) <= _FARTHEST:
+        raise ValueError(f"median depth is {median:g} m; metres are expected, {_NEAREST:g} to {_FARTHEST:g}")
+    return depth
 
 
 def rays(K: Intrinsics, height: int, width: int) -> Floats:

@@ -2,6 +2,7 @@
 
 import re
 
+TABLE = "table"
 DOMAIN = """\
 ; Picking and placing on a table. Items rest on convex items and on the table, and in concave items.
 (define (domain scene)
@@ -76,4 +77,4 @@ DOMAIN = """\
 def symbol(name: str) -> str:
     """A name that PDDL accepts: lower case, letters first, no blanks."""
     plain = re.sub(r"[^a-z0-9_-]", "_", name.lower())
-    return plain if plain[0].isalpha() else f"o_{plain}"
+    return plain if plain[:1].isalpha() else f"o_{plain}"

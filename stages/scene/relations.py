@@ -25,9 +25,9 @@ import numpy as np
 
 from stages.geometry import regions
 from stages.messages.scene import Assertion, UnknownRegion
+from stages.scene.domain import TABLE
 from stages.scene.stance import Standing
 
-TABLE = "table"
 _INWARDS = 0.01
 """Metres from the edge of a surface within which the middle of something may be beside it."""
 _HIDDEN = 0.05

@@ -272,13 +272,8 @@ def _region(
     if parent not in poses or child not in poses:
         valid = f"poses of both in comments, and (has ITEM {region}) in :init"
         raise _refusal(fact.line, str(fact), "says not where that is beside which item", valid)
-    return VirtualObject(
-        name=region,
-        parent=names[parent],
-        child=names[child],
-        T_parent_virtual=inverse(poses[parent]) @ poses[child],
-        radius=virtual.RADIUS,
-    )
+    T_parent_virtual = inverse(poses[parent]) @ poses[child]
+    return virtual.region(names[parent], names[child], T_parent_virtual, virtual.RADIUS)
 
 
 # ---------------------------------------------------------------------------------------------------- what is not

@@ -104,6 +104,8 @@ def test_realsense_settings_are_checked() -> None:
         RealSenseCamera.Config(T_base_camera=(1.0, 0.0, 0.0))
     with pytest.raises(Refused, match=r"camera\.T_base_camera: .* is no pose"):
         RealSenseCamera.Config(T_base_camera=(2.0, *np.eye(4).ravel()[1:].tolist()))
+    with pytest.raises(Refused, match=r"camera\.T_base_camera: the camera is 800 m away; metres are expected"):
+        RealSenseCamera.Config(T_base_camera=tuple((np.eye(4) + np.diag([800.0], 3)).ravel().tolist()))
 
 
 def record(folder: Path, frames: list[Frame]) -> Path:

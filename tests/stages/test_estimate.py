@@ -10,7 +10,7 @@ import pytest
 from runner.contract import Context, Refused
 from stages.estimate import Box, EstimatedScene, estimate_scene
 from stages.geometry.lens import INVERSE, Lens
-from stages.geometry.poses import inverse
+from stages.geometry.poses import inverse, pose
 from stages.messages import Candidate, Candidates, Frame
 from tests.stages.perception.scenes import CATALOGUE_FILE, VIEW, K, Rendered, camera, render, upright
 
@@ -104,6 +104,8 @@ def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
         estimate_scene(RGB / 255, depth, K, CATALOGUE_FILE, boxes=given)  # type: ignore[arg-type]
     with pytest.raises(Refused, match=r"depth is uint16 .* of floats, metres, is expected"):
         estimate_scene(RGB, (1000 * depth).astype(np.uint16), K, CATALOGUE_FILE, boxes=given)  # type: ignore[arg-type]
+    with pytest.raises(Refused, match=r"median depth is 7\d\d\..* m; metres are expected, 0\.05 to 20"):
+        estimate_scene(RGB, 1000 * depth, K, CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match=r"K is \(4,\); 3 x 3 is expected"):
         estimate_scene(RGB, depth, np.zeros(4), CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match=r"K = .*: must be fx 0 cx, .* without skew"):
@@ -116,6 +118,32 @@ def test_inputs_are_checked(seen: Rendered, tmp_path: Path) -> None:
         estimate_scene(RGB, np.zeros_like(depth), K, CATALOGUE_FILE, boxes=given)
     with pytest.raises(Refused, match="no such catalogue"):
         estimate_scene(RGB, depth, K, tmp_path / "none.yaml", boxes=given)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (np.eye(4)[:3], r"\[\[.* is no pose; 4 x 4, a rotation and metres above 0 0 0 1, is"),
+        (np.diag([2.0, 2, 2, 1]), r"\[\[2\.0, .* is no pose; 4 x 4"),
+        (np.diag([1.0, 1, np.nan, 1]), r".* nan, .* is no pose; 4 x 4"),
+        (pose(np.eye(3), np.array([0.0, 0, 1200])), "the camera is 1200 m away; metres are expected, 100 at most"),
+    ],
+)
+def test_where_the_camera_is_is_checked(seen: Rendered, wrong: np.ndarray, says: str) -> None:
+    with pytest.raises(Refused, match="^T_base_camera: " + says):
+        estimate_scene(RGB, seen.scene.depth, K, CATALOGUE_FILE, boxes=boxes(seen, "mug"), T_base_camera=wrong)
+
+
+def test_boxes_and_confidences_are_finite_numbers_and_images_have_pixels(seen: Rendered) -> None:
+    depth = seen.scene.depth
+    for box in ((0, 0, np.nan, 9), (0, 0, np.inf, 9), (0, 0, 9)):
+        with pytest.raises(Refused, match=r"box of mug: .* is not x0, y0, x1, y1 with x0 < x1"):
+            estimate_scene(RGB, depth, K, CATALOGUE_FILE, boxes=[("mug", box)])
+    for confidence in (np.nan, 7.0, -0.1):
+        with pytest.raises(Refused, match=rf"box of mug: confidence {confidence:g} must lie from 0 to 1"):
+            estimate_scene(RGB, depth, K, CATALOGUE_FILE, boxes=[("mug", (0, 0, 9, 9), confidence)])
+    with pytest.raises(Refused, match=r"rgb is uint8 \(0, 320, 3\); H x W x 3 .*, of a pixel or more"):
+        estimate_scene(RGB[:0], depth[:0], K, CATALOGUE_FILE, boxes=boxes(seen, "mug"))
 
 
 def test_a_catalogue_that_the_network_does_not_know_needs_boxes(seen: Rendered, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ def fact(predicate: str, *names: str) -> str:
 def pose_comments(scene: SceneGraph, prefix: str) -> list[str]:
     """One comment for each object that has a place: its pose label and the pose in the base frame."""
     placed = (item for item in scene.objects if not item.anywhere)
-    return [f"; {symbol(prefix + item.name):24} {_pose(item.T_base_object)}" for item in placed]
+    return [f"; {prefix + symbol(item.name):24} {_pose(item.T_base_object)}" for item in placed]
 
 
 def _pose(T: Floats) -> str:
@@ -65,7 +65,7 @@ def _block(name: str, lines: Iterable[str]) -> list[str]:
 
 def _typed(items: Sequence[str], goal: SceneGraph) -> list[str]:
     regions = [item.name for item in goal.virtual_objects]
-    lists = {"item": items, "region": regions, "label": [f"pos_{item}" for item in items]}
+    lists = {"item": items, "region": regions, "label": [f"pos_{symbol(item)}" for item in items]}
     return [f"{' '.join(map(symbol, names))} - {kind}" for kind, names in lists.items() if names]
 
 
@@ -75,7 +75,7 @@ def _init(problem: Problem, goal: SceneGraph) -> list[str]:
     return [
         "(handempty)",
         *(fact("exist", item) for item in problem.items),
-        *(fact("at", item, f"pos_{item}") for item in problem.items),
+        *(fact("at", item, f"pos_{symbol(item)}") for item in problem.items),
         *(fact("in" if s in problem.concave else "on", item, s) for item, s in problem.supports.items()),
         *(fact("clear", item) for item in problem.items if item not in occupied),
         *(fact("graspable", item) for item in problem.items if item in problem.graspable),

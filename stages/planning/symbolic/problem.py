@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from stages.messages.scene import SceneGraph
+from stages.scene.domain import TABLE
 from stages.scene.facing import sides
-
-TABLE = "table"
 
 
 @dataclass(frozen=True)

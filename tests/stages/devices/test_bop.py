@@ -78,12 +78,19 @@ def shrink_depth(dataset: Path) -> None:
     Image.fromarray(np.zeros((6, 8), np.uint16)).save(dataset / "test/000002/depth/000003.png")
 
 
+def depth_of_mode(mode: str) -> Callable[[Path], None]:
+    return lambda dataset: Image.new(mode, (16, 12), 100).save(dataset / "test/000002/depth/000003.png")
+
+
 DAMAGES = [
     (delete("test/000002/depth/000003.png"), r"000002/depth/000003\.png: the depth image is missing"),
     (delete("test/000002/rgb/000005.png"), r"000002/rgb/000005\.png: the colour image is missing"),
     (delete("test/000002/scene_camera.json"), r"scene_camera\.json: cannot be read: No such file"),
     (delete("test_targets_bop19.json"), r"test_targets_bop19\.json: cannot be read: No such file"),
     (shrink_depth, r"depth/000003\.png: 8 x 6 pixels, but the colour image has 16 x 12"),
+    (depth_of_mode("L"), r"depth/000003\.png: an image of mode L; depth is one channel of 16 bits \(I;16, I;16B, I\)"),
+    (depth_of_mode("P"), r"depth/000003\.png: an image of mode P; depth is one channel of 16 bits"),
+    (depth_of_mode("RGB"), r"depth/000003\.png: an image of mode RGB; depth is one channel of 16 bits"),
     (edit_camera(lambda c: c.pop("5")), r"scene_camera\.json: image 5 is missing; there are 3"),
     (edit_camera(lambda c: c["5"].pop("cam_K")), r"scene_camera\.json: image 5: .*`cam_K`"),
     (edit_camera(lambda c: c["5"].pop("depth_scale")), r"scene_camera\.json: image 5: .*`depth_scale`"),
@@ -106,6 +113,13 @@ def test_damage_is_refused_before_the_first_image(
         read_dataset(dataset)
     assert re.search(message, str(refusal.value)), str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_scale_that_turns_metres_into_millimetres_is_refused(dataset: Path) -> None:
+    edit_camera(lambda c: c["5"].update(depth_scale=1e-4))(dataset)
+    image, _ = read_dataset(dataset)
+    with pytest.raises(Refused, match=r"5\.png: median depth is 0\.0005 m; .*; a unit is depth_scale = 0\.0001 milli"):
+        image.read()
 
 
 def test_missing_data_set_is_refused(tmp_path: Path) -> None:

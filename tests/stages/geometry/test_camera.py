@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from stages.geometry.camera import (
     back_project,
+    checked_depth,
     checked_intrinsics,
     cropped,
     intrinsics,
@@ -71,3 +72,15 @@ def test_a_matrix_that_is_no_pinhole_cameras_is_refused(row: int, column: int, v
     wrong[row, column] = value
     with pytest.raises(ValueError, match=rf"K = .*{value}.*: must be fx 0 cx, 0 fy cy, 0 0 1 .* without skew"):
         checked_intrinsics(wrong)
+
+
+def test_depth_that_cannot_be_metres_is_refused() -> None:
+    depth = np.full((3, 4), 1.0, np.float32)
+    depth[0] = [0, -5000, np.nan, np.inf]
+    assert checked_depth(depth) is depth
+    for empty in (np.zeros((3, 4), np.float32), np.zeros((0, 4), np.float32)):
+        assert checked_depth(empty) is empty
+    with pytest.raises(ValueError, match=r"median depth is 1000 m; metres are expected, 0\.05 to 20"):
+        checked_depth(1000 * depth)
+    with pytest.raises(ValueError, match=r"median depth is 0\.001 m; metres are expected"):
+        checked_depth(depth / 1000)

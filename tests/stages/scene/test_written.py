@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +15,9 @@ from hypothesis import strategies as st
 from runner.contract import Refused
 from stages.messages import SceneGraph
 from stages.planning.symbolic.pddl import goal_pddl
+from stages.scene import virtual
+from stages.scene.catalogue import Catalogue
+from stages.scene.domain import TABLE
 from stages.scene.stance import Standing, is_tipped
 from stages.scene.written import scene_of
 from tests.stages.layouts import Layout, asserted, breakfast, catalogue, label_of, stances
@@ -77,6 +83,42 @@ def test_what_is_beside_what_is_read_from_the_poses_of_both() -> None:
         assert np.allclose(now.T_parent_virtual, shown.T_parent_virtual, atol=5e-4)
     with pytest.raises(Refused, match=r"line \d+: '\(in \w+_near_\w+ \w+\)': .*valid: poses of both in comments"):
         read(without_poses(text))
+
+
+@pytest.mark.parametrize("called", ["024_bowl", "Öl", "jam jar"])
+def test_a_goal_of_objects_of_any_name_is_read_back(called: str) -> None:
+    ours = Catalogue({called: replace(catalogue()["milk_carton"], name=called), "tray": catalogue()["tray"]})
+    names = {"milk_carton": called, "milk_carton_2": f"{called}_2", "tray": "tray"}
+    taught = renamed(
+        Layout().put("tray", 0, 0).put("milk_carton", 0.0, 0.30).put("milk_carton_2", 0.0, 0.39).graph(), names
+    )
+    assert taught.virtual_objects
+    again = scene_of(goal_pddl("taught", taught), ours)
+    assert set(map(str, again.assertions)) == set(map(str, taught.assertions))
+    for now, shown in zip(again.objects, taught.objects, strict=True):
+        assert (now.name, now.label) == (shown.name, shown.label)
+        assert np.allclose(now.T_base_object, shown.T_base_object, atol=2e-4)
+
+
+def renamed(scene: SceneGraph, names: Mapping[str, str]) -> SceneGraph:
+    """The same scene of objects of other names; equal ones have the label of the first."""
+    regions = tuple(
+        virtual.region(names[item.parent], names[item.child], item.T_parent_virtual, item.radius)
+        for item in scene.virtual_objects
+    )
+    before = [item.name for item in scene.virtual_objects]
+    names = {**names, **dict(zip(before, [item.name for item in regions], strict=True)), TABLE: TABLE}
+    return msgspec.structs.replace(
+        scene,
+        objects=tuple(
+            msgspec.structs.replace(item, name=names[item.name], label=names[item.label]) for item in scene.objects
+        ),
+        virtual_objects=regions,
+        assertions=tuple(
+            msgspec.structs.replace(item, arguments=tuple(names[one] for one in item.arguments))
+            for item in scene.assertions
+        ),
+    )
 
 
 def test_a_goal_asks_only_for_what_it_names() -> None:

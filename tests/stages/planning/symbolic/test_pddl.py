@@ -32,7 +32,14 @@ def test_every_type_is_declared_as_strict_parsers_want_it():
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("Cup", "cup"), ("003_cracker box", "o_003_cracker_box"), ("tea-box", "tea-box")]
+    ("name", "expected"),
+    [
+        ("Cup", "cup"),
+        ("003_cracker box", "o_003_cracker_box"),
+        ("tea-box", "tea-box"),
+        ("table", "table"),
+        ("", "o_"),
+    ],
 )
 def test_names_become_symbols(name: str, expected: str):
     assert symbol(name) == expected

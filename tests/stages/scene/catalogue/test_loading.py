@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.exchange.ply import export_ply
 
 from runner.contract import Refused
 from stages.scene.catalogue import Catalogue
@@ -42,7 +44,8 @@ def test_any_format_loads_with_defaults(folder: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("inch", 0.0254)])
 def test_units(folder: Path, unit: str, scale: float) -> None:
-    np.testing.assert_allclose(load(folder, mesh(unit=unit))["jar"].dimensions, np.array(BOX) * scale, rtol=1e-6)
+    trimesh.creation.box(0.01 * np.array(BOX) / scale).export(folder / "box.ply")
+    np.testing.assert_allclose(load(folder, mesh(unit=unit))["jar"].dimensions, 0.01 * np.array(BOX), rtol=1e-6)
 
 
 def test_shorthands_expand(folder: Path) -> None:
@@ -117,6 +120,39 @@ def test_mistakes_are_refused_in_one_line(folder: Path, body: str, message: str)
     assert "\n" not in str(refusal.value)
 
 
+NAMES = [
+    (
+        ["table"],
+        r":2: objects\.table: 'table' and the table itself are both 'table' in goals; names differ in letters a to z",
+    ),
+    (["Table"], r":2: objects\.Table: 'Table' and the table itself are both 'table' in goals"),
+    (["cup", "jam jar", "jam_jar"], r":6: objects\.jam_jar: 'jam_jar' and 'jam jar' are both 'jam_jar' in goals"),
+    (["чашка", "ложка"], r":4: objects\.ложка: 'ложка' and 'чашка' are both 'o______' in goals"),
+    ([""], r":2: objects: '' is no name of an object"),
+    (["cup", "  "], r":4: objects\.  : '  ' is no name of an object"),
+]
+
+
+@pytest.mark.parametrize(("names", "message"), NAMES)
+def test_names_that_goals_cannot_tell_apart_are_refused(folder: Path, names: list[str], message: str) -> None:
+    file = folder / "catalogue.yaml"
+    file.write_text("objects:\n" + "".join(f'  "{name}":\n{mesh()}' for name in names), encoding="utf-8")
+    with pytest.raises(Refused, match=message):
+        Catalogue.load(file)
+
+
+def test_names_of_bop_models_are_checked_alike(folder: Path) -> None:
+    trimesh.creation.box([60, 80, 100]).export(folder / "obj_000001.ply")
+    trimesh.creation.box([60, 80, 100]).export(folder / "obj_000002.ply")
+    for one, other, message in (
+        ("jar", "jar", r":1: 2: 'jar' and 'jar' are both 'jar' in goals"),
+        ("024_bowl", "table", r":1: 2: 'table' and the table itself are both 'table' in goals"),
+    ):
+        (folder / "models_info.json").write_text(f'{{"1": {{"name": "{one}"}}, "2": {{"name": "{other}"}}}}')
+        with pytest.raises(Refused, match=message):
+            Catalogue.load(folder)
+
+
 def test_missing_catalogue_is_refused(tmp_path: Path) -> None:
     with pytest.raises(Refused, match=r"nothing\.yaml: no such catalogue"):
         Catalogue.load(tmp_path / "nothing.yaml")
@@ -131,6 +167,40 @@ def test_bop_folder_with_a_missing_mesh_is_refused(tmp_path: Path) -> None:
     (tmp_path / "models_info.json").write_text('{"3": {}}')
     with pytest.raises(Refused, match=r"obj_000003\.ply: no such mesh file"):
         Catalogue.load(tmp_path)
+
+
+def test_a_mesh_of_another_unit_is_refused(folder: Path) -> None:
+    says = r"box\.ply in m is 10 m long; 0\.005 to 3 m are expected; is cm \(0\.1 m\) or mm .* or inch .* meant\?"
+    with pytest.raises(Refused, match=r":3: objects\.jar\.mesh: " + says):
+        load(folder, mesh(unit="m"))
+
+
+def test_a_mesh_that_is_large_or_small_in_every_unit_is_refused(folder: Path) -> None:
+    for scale, says in (
+        (1e6, r"1e\+04 m long; 0\.005 to 3 m are expected$"),
+        (1e-3, r"1e-05 m long; .*; is m \(0\.01 m\)"),
+    ):
+        trimesh.creation.box(np.array(BOX) * scale).export(folder / "odd.ply")
+        with pytest.raises(Refused, match=says):
+            load(folder, mesh("odd.ply", "mm"))
+
+
+def test_a_bop_model_in_metres_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "models_info.json").write_text('{"3": {}}')
+    trimesh.creation.box([0.1, 0.1, 0.2]).export(tmp_path / "obj_000003.ply")
+    with pytest.raises(
+        Refused, match=r"models_info\.json:1: 3: obj_000003\.ply in mm is 0\.0002 m long; .* is m \(0\.2 m\)"
+    ):
+        Catalogue.load(tmp_path)
+
+
+@pytest.mark.parametrize("more", ["", "    mass: 1\n    resting: [upright]\n"])
+def test_a_flat_mesh_is_refused(folder: Path, more: str) -> None:
+    flat = trimesh.creation.box([9, 9, 0])
+    flat.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    flat.export(folder / "flat.ply")
+    with pytest.raises(Refused, match=r":3: objects\.jar\.mesh: flat\.ply is flat; an object has a volume"):
+        load(folder, mesh("flat.ply") + more)
 
 
 def test_a_link_that_git_wrote_as_a_file_is_followed(tmp_path: Path) -> None:
@@ -153,9 +223,55 @@ def test_unreadable_mesh_is_refused_with_the_formats(folder: Path) -> None:
 
 def test_textured_mesh_gets_vertex_colours(folder: Path) -> None:
     box = trimesh.creation.box(BOX)
-    from PIL import Image
-
     texture = Image.new("RGB", (4, 4), (200, 10, 20))
     box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), image=texture)
     box.export(folder / "painted.glb")
     assert (load(folder, mesh("painted.glb"))["jar"].mesh.colors == (200, 10, 20)).all()
+
+
+PAINTED = "".join(f"v {corner}\n" for corner in ("0 0 0", "9 0 0", "0 9 0", "0 0 9")) + "vt 0 0\nusemtl paint\n"
+PAINTED += "".join(f"f {a}/1 {b}/1 {c}/1\n" for a, b, c in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4)))
+
+
+def test_a_mesh_whose_material_or_texture_is_missing_is_refused(folder: Path) -> None:
+    (folder / "painted.obj").write_text("mtllib painted.mtl\n" + PAINTED)
+    with pytest.raises(
+        Refused, match=r":3: .*mesh\.file: .*painted\.obj: its material or texture painted\.mtl is missing"
+    ):
+        load(folder, mesh("painted.obj"))
+    (folder / "painted.mtl").write_text("newmtl paint\nKd 0.8 0.1 0.1\nmap_Kd paint.png\n")
+    with pytest.raises(Refused, match=r"painted\.obj: its material or texture paint\.png is missing"):
+        load(folder, mesh("painted.obj"))
+    whole = trimesh.creation.box(BOX)
+    whole.visual = trimesh.visual.TextureVisuals(uv=np.full((len(whole.vertices), 2), 0.5))
+    header, _, body = export_ply(whole, encoding="ascii").partition(b"element vertex")
+    (folder / "painted.ply").write_bytes(header + b"comment TextureFile paint.png\nelement vertex" + body)
+    with pytest.raises(Refused, match=r"painted\.ply: its material or texture paint\.png is missing"):
+        load(folder, mesh("painted.ply"))
+
+
+def test_a_texture_may_lie_in_another_folder_and_a_material_may_have_none(folder: Path) -> None:
+    (folder / "meshes").mkdir()
+    (folder / "meshes" / "painted.obj").write_text("mtllib painted.mtl\n" + PAINTED)
+    for line, color in (("", (204, 26, 26)), ("map_Kd ../paint.png\n", (200, 10, 20))):
+        (folder / "meshes" / "painted.mtl").write_text(f"newmtl paint\nKd 0.8 0.1 0.1\n{line}")
+        Image.new("RGB", (4, 4), (200, 10, 20)).save(folder / "paint.png")
+        assert (load(folder, mesh("meshes/painted.obj"))["jar"].mesh.colors == color).all()
+    box = trimesh.creation.box(BOX)
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[200, 10, 20, 255])
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), material=material)
+    box.export(folder / "painted.glb")
+    assert (load(folder, mesh("painted.glb"))["jar"].mesh.colors == (200, 10, 20)).all()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+@pytest.mark.parametrize("color", [None, (200, 10, 20, 255)])
+def test_a_vertex_of_no_triangle_does_not_count(folder: Path, suffix: str, color: tuple[int, ...] | None) -> None:
+    box = trimesh.creation.box(BOX)
+    colors = None if color is None else [(0, 0, 0, 255), *[color] * len(box.vertices)]
+    vertices, faces = np.vstack([[500.0, 500, 500], box.vertices]), box.faces + 1
+    trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False).export(folder / f"far.{suffix}")
+    jar = load(folder, mesh(f"far.{suffix}"))["jar"]
+    np.testing.assert_allclose(jar.dimensions, [0.06, 0.08, 0.10], atol=1e-6)
+    np.testing.assert_allclose(jar.mesh.vertices[jar.mesh.faces], 0.01 * box.triangles, atol=1e-6)
+    assert color is None or (jar.mesh.colors == color[:3]).all()
