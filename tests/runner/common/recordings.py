@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from runner.graph.graph import SUPERVISOR, Graph, graph_to_json
 from runner.graph.reading import load_graph
@@ -119,12 +119,16 @@ class ToyRun:
 
 
 def rewrite(
-    source: Path, target: Path, change: Callable[[str, bytes], bytes], aspects: Mapping[str, str] | None = None
+    source: Path,
+    target: Path,
+    change: Callable[[str, bytes], bytes],
+    aspects: Mapping[str, str] | None = None,
+    compression: CompressionType = CompressionType.ZSTD,
 ) -> Path:
     """Copies a recording; ``change`` gets each topic and payload and returns what is kept in its place, ``aspects``
     replace what its metadata says of the run."""
     with source.open("rb") as file, target.open("wb") as output:
-        reader, writer = make_reader(file), Writer(output)
+        reader, writer = make_reader(file), Writer(output, compression=compression)
         writer.start()
         metadata = {found.name: found.metadata for found in reader.iter_metadata()}
         run = {**metadata.pop(RUN), **(aspects or {})}

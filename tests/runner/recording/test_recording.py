@@ -3,6 +3,7 @@ import io
 import json
 import os
 import shutil
+import struct
 import threading
 import time
 from collections import Counter
@@ -17,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from runner.contract import Refused
 from runner.graph.reading import load_graph
@@ -27,10 +28,12 @@ from runner.recording import writer as writer_module
 from runner.recording.container import Container, Growing, is_being_written
 from runner.recording.provenance import file_hashes
 from runner.recording.recording import Completeness, Recording
+from runner.recording.recover import recover
 from runner.recording.writer import RecordingWriter
-from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys
+from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys, rewrite
 from tests.runner.common.toys import Number, Total
 
+TOPICS = {"counter/number", "splitter/piece", "worker/answer", "gatherer/total", "sink/finished"}
 FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -431,6 +434,32 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path: Path):
     assert "counter.number#0" not in recording.messages
     assert "counter.number#9" in recording.messages
     assert not recording.verdict.complete
+
+
+def test_a_summary_that_is_not_what_was_written_is_damage_and_no_word_of_it_holds(toys: Path, tmp_path: Path):
+    content, damaged = toys.read_bytes(), tmp_path / "damaged.mcap"
+    summary, offsets = struct.unpack_from("<QQ", content, len(content) - 28)
+    for at in (*range(summary + 9, offsets, 211), content.index(b"worker/answer", summary)):
+        damaged.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+        recording = Recording(damaged)
+        assert not recording.verdict.complete, at
+        assert {message.topic for message in recording.messages.values()} == TOPICS
+    assert recording.damage == [f"byte {len(content) - 37}: the checksum of the summary does not match its content"]
+    _, target = recover(damaged, tmp_path / "clean.mcap")
+    assert {message.topic for message in Recording(target).messages.values()} == TOPICS
+    assert str(Recording(target).verdict) == str(recording.verdict)
+
+
+def test_a_topic_that_a_damaged_chunk_names_is_taken_from_elsewhere(toys: Path, tmp_path: Path):
+    path = rewrite(toys, tmp_path / "damaged.mcap", lambda _, data: data, compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"worker/answer")] ^= 1
+    for cut, topics in ((None, TOPICS), (content.index(b"COMPLETE"), TOPICS - {"worker/answer"} | {"vorker/answer"})):
+        path.write_bytes(content[:cut])
+        recording = Recording(path)
+        assert "the chunk's checksum does not match" in recording.damage[0]
+        assert len(recording.messages) == 51
+        assert {message.topic for message in recording.messages.values()} == topics
 
 
 @pytest.mark.parametrize(
