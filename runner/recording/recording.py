@@ -311,10 +311,9 @@ class Recording:
     def _breakage(self) -> str:
         if self.torn:
             return f"torn at {self.damage[-1]}"
-        if self.damage:
-            return f"damaged at {self.damage[0]}"
-        written = self.metadata.get(VERDICT, {}).get("run", "")
-        return f"metadata {RUN!r} is not what was written" if written not in ("", hash_of(self.run)) else ""
+        if self.metadata.get(VERDICT, {}).get("run", "") not in ("", hash_of(self.run)):
+            return f"metadata {RUN!r} is not what was written"
+        return f"damaged at {self.damage[0]}" if self.damage else ""
 
     @property
     def _says_ends(self) -> bool:

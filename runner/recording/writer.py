@@ -143,7 +143,10 @@ class RecordingWriter:
         self._proving = threading.Lock()
         self._file = _create(self._path)
         self._index_file = tempfile.TemporaryFile(buffering=0, dir=self._path.parent)  # noqa: SIM115 - see _write_all
-        self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
+        # A chunk ends in _flush.
+        self._writer = Writer(
+            self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4, enable_data_crcs=True
+        )
         own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
         vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
         self._writer.start(profile=PROFILE)

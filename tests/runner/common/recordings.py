@@ -1,5 +1,6 @@
 """Makes recordings of the toy graph without processes: the same steps, journal and writer as in a run."""
 
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -7,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import CompressionType, Writer
 
 from runner.graph.graph import SUPERVISOR, Graph, graph_to_json
@@ -116,6 +119,16 @@ class ToyRun:
         number, self._numbers[process] = self._numbers[process], self._numbers[process] + 1
         step = Step(*process, 0, number, handler, (), (), 0, 0, 0, 1000)
         return msgspec.structs.replace(step, **fields)
+
+
+def offsets(content: bytes | bytearray, opcode: Opcode) -> list[int]:
+    """Where the records of a kind begin in an MCAP file."""
+    at, found = MAGIC_SIZE, list[int]()
+    while at < len(content) - MAGIC_SIZE:
+        kind, length = struct.unpack_from("<BQ", content, at)
+        found += [at] if kind == opcode else []
+        at += 9 + length
+    return found
 
 
 def rewrite(

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -30,7 +31,7 @@ from runner.recording.provenance import file_hashes
 from runner.recording.recording import Completeness, Recording
 from runner.recording.recover import recover
 from runner.recording.writer import RecordingWriter
-from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys, rewrite
+from tests.runner.common.recordings import TOYS, ToyRun, manifest, offsets, put, record, record_toys, rewrite
 from tests.runner.common.toys import Number, Total
 
 TOPICS = {"counter/number", "splitter/piece", "worker/answer", "gatherer/total", "sink/finished"}
@@ -391,15 +392,26 @@ def test_a_cut_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path
         assert "\n" not in str(refused)
 
 
+@pytest.mark.parametrize("recovered", [False, True])
+def test_where_messages_lie_is_under_a_checksum_too(toys: Path, tmp_path: Path, recovered: bool):
+    path, damaged = recover(toys, tmp_path / "a.mcap")[1] if recovered else toys, tmp_path / "b.mcap"
+    assert Recording(path).verdict.complete
+    content = bytearray(path.read_bytes())
+    (end,) = offsets(content, Opcode.DATA_END)
+    content[offsets(content, Opcode.MESSAGE_INDEX)[1] - 1] ^= 1
+    damaged.write_bytes(content)
+    assert Recording(damaged).damage == [f"byte {end}: the checksum of the data section does not match its content"]
+
+
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @FEW
-def test_a_flipped_bit_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path, share: float, bit: int):
+def test_a_flipped_bit_anywhere_is_found_or_one_clear_line(toys: Path, tmp_path: Path, share: float, bit: int):
     content = bytearray(toys.read_bytes())
     content[int(share * len(content))] ^= 1 << bit
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
     try:
-        describe(damaged)
+        assert f"{damaged}: INCOMPLETE" in describe(damaged)
         for sealed in Recording(damaged).envelopes():
             assert sealed.id
     except Refused as refused:
