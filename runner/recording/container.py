@@ -80,6 +80,8 @@ class Container:
                 record = next(records)
             except StopIteration:
                 self.torn = False
+                if self._stream.read(1):
+                    self._note(self._stream.tell() - 1, "the file goes on after its end")
                 return
             except BROKEN as error:
                 if offset == 0 and self._stream.tell() <= MAGIC_SIZE:

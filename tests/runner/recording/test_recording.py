@@ -392,6 +392,14 @@ def test_a_cut_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path
         assert "\n" not in str(refused)
 
 
+def test_a_file_that_goes_on_after_its_end_is_not_complete(toys: Path, tmp_path: Path):
+    content, path = toys.read_bytes(), tmp_path / "long.mcap"
+    for more in (b"\n", content):
+        path.write_bytes(content + more)
+        verdict = Recording(path).verdict
+        assert str(verdict) == f"INCOMPLETE: damaged at byte {len(content)}: the file goes on after its end"
+
+
 @pytest.mark.parametrize("recovered", [False, True])
 def test_where_messages_lie_is_under_a_checksum_too(toys: Path, tmp_path: Path, recovered: bool):
     path, damaged = recover(toys, tmp_path / "a.mcap")[1] if recovered else toys, tmp_path / "b.mcap"
