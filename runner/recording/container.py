@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import struct
 import time
 import zlib
@@ -16,7 +17,7 @@ from typing import IO, cast
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Metadata, MetadataIndex, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import MAGIC_SIZE, CRCValidationError, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
@@ -30,11 +31,15 @@ _HEAD = struct.Struct("<BQ")
 """Of every record: opcode and length."""
 _MESSAGE = struct.Struct("<HIQQ")
 """What then stands before a message's payload: channel, sequence, log and publish time."""
-_KINDS: dict[int, type[Channel | Schema | Chunk | Metadata]] = {
+_FOOTER = struct.Struct("<BQQQI8s")
+"""The end of a file: opcode, length, where the summary and its offsets begin, its checksum, and the magic number."""
+_KINDS: dict[int, type[Channel | Schema | Chunk | ChunkIndex | Metadata | MetadataIndex]] = {
     Opcode.CHANNEL: Channel,
     Opcode.SCHEMA: Schema,
     Opcode.CHUNK: Chunk,
+    Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
 }
 """Other records that are read."""
 
@@ -72,8 +77,11 @@ class Container:
         self.schemas: dict[int, Schema] = known.schemas if known else {}
 
     def __iter__(self) -> Iterator[Entry | Metadata]:
-        """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all."""
-        records = _records(self._stream)
+        """Everything up to the end or the tear; raises Refused where the stream is no MCAP at all.
+
+        Where it is not known where the next record begins, reading goes on where the summary says that one does.
+        """
+        records, reached = _records(self._stream), 0
         while True:
             offset = self._stream.tell()
             try:
@@ -89,7 +97,13 @@ class Container:
                     what = "not an MCAP file" if foreign else "empty or cut off in its first bytes"
                     raise Refused(f"{self._name}: {what}") from None
                 self._note(offset, _reason(error))
-                return
+                reached = next((place for place in _places(self._stream) if place > reached), 0)
+                if not reached:
+                    return
+                self._stream.seek(reached)
+                records = _records(self._stream, whole=False)
+                continue
+            reached = offset if isinstance(record, Chunk | Metadata) else reached
             yield from self._entries(record, offset)
 
     def entries_at(self, file: IO[bytes], offset: int, end: int | None = None) -> Iterator[Entry]:
@@ -175,6 +189,28 @@ def _records(stream: IO[bytes] | Growing, *, whole: bool = True) -> Iterator[Mca
             checksum = zlib.crc32(content, zlib.crc32(head, checksum))
             yield _record(opcode, content)
     _magic(stream)
+
+
+def _places(stream: IO[bytes] | Growing) -> list[int]:
+    """Where chunks, metadata and the summary begin, if that stands at the end of the file and is sound."""
+    places: list[int] = []
+    try:
+        stream.seek(-_FOOTER.size, os.SEEK_END)
+        opcode, _, start, _, _, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
+        if (opcode, magic) != (Opcode.FOOTER, MCAP0_MAGIC):
+            return []
+        stream.seek(start)
+        for record in _records(stream, whole=False):
+            match record:
+                case ChunkIndex(chunk_start_offset=place) | MetadataIndex(offset=place):
+                    places.append(place)
+                case str():
+                    return []
+                case _:
+                    pass
+    except (*BROKEN, OSError):
+        return []
+    return sorted([*places, start])
 
 
 def _compared(section: str, last: bytes, checksum: int) -> str | None:
@@ -291,6 +327,10 @@ class Growing:
     def tell(self) -> int:
         """Position of the next byte."""
         return self._file.tell()
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        """Another position."""
+        return self._file.seek(offset, whence)
 
 
 def hold(file: IO[bytes]) -> None:

@@ -25,6 +25,7 @@ from runner.contract import Refused
 from runner.graph.reading import load_graph
 from runner.inspect.info import describe
 from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelope
+from runner.message.ids import MessageId
 from runner.recording import writer as writer_module
 from runner.recording.container import Container, Growing, is_being_written
 from runner.recording.provenance import file_hashes
@@ -58,15 +59,20 @@ def number(sequence: int) -> Envelope:
 # ------------------------------------------------------------------------------------ content
 
 
-def test_the_index_at_the_end_names_every_chunk_and_grows_by_bytes_only(tmp_path: Path):
-    recorder = writer(tmp_path / "a.mcap")
-    for sequence in range(3):
+def in_chunks(path: Path, count: int) -> Path:
+    """A recording of so many messages, each in a chunk of its own."""
+    recorder = writer(path)
+    for sequence in range(count):
         flushed = threading.Event()
         put(recorder, number(sequence))
         recorder.after_flush(flushed.set)
         assert flushed.wait(10)
     recorder.close()
-    with (tmp_path / "a.mcap").open("rb") as file:
+    return path
+
+
+def test_the_index_at_the_end_names_every_chunk_and_grows_by_bytes_only(tmp_path: Path):
+    with in_chunks(tmp_path / "a.mcap", 3).open("rb") as file:
         summary = make_reader(file).get_summary()
         found = [message.sequence for _, _, message in make_reader(file).iter_messages(topics=["counter/number"])]
     assert summary is not None and summary.statistics is not None
@@ -480,6 +486,41 @@ def test_a_topic_that_a_damaged_chunk_names_is_taken_from_elsewhere(toys: Path, 
         assert "the chunk's checksum does not match" in recording.damage[0]
         assert len(recording.messages) == 51
         assert {message.topic for message in recording.messages.values()} == topics
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX])
+@pytest.mark.parametrize("which", [0, 2, 5])
+def test_damage_to_a_frame_costs_no_more_than_its_chunk(tmp_path: Path, opcode: Opcode, which: int):
+    content = in_chunks(tmp_path / "whole.mcap", 6).read_bytes()
+    path, at = tmp_path / "damaged.mcap", offsets(content, opcode)[which]
+    lengths = [(at + 1 + bit // 8, bytes([content[at + 1 + bit // 8] ^ 1 << bit % 8])) for bit in range(0, 64, 5)]
+    for begin, damage in (*lengths, (at - (20 if which else 0), bytes(30)), (at, b"\0")):
+        path.write_bytes(content[:begin] + damage + content[begin + len(damage) :])
+        recording = Recording(path)
+        assert not recording.verdict.complete
+        assert not recording.torn
+        assert {0, 1, 2, 3, 4, 5} - {which} <= {sealed.sequence for sealed in map(MessageId.of, recording.messages)}
+        assert [sealed.id for sealed in recording.envelopes()] == list(recording.messages)
+        assert {"run", "verdict"} == set(recording.metadata)
+
+
+def test_damage_to_a_frame_costs_what_follows_where_nothing_says_how_it_goes_on(tmp_path: Path):
+    content = bytearray(in_chunks(tmp_path / "whole.mcap", 3).read_bytes())
+    content[offsets(content, Opcode.CHUNK)[1] + 3] ^= 1
+    content[-12] ^= 1  # of the checksum of the summary
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    recording = Recording(tmp_path / "damaged.mcap")
+    assert recording.torn
+    assert list(recording.messages) == ["counter.number#0"]
+
+
+def test_damage_to_the_verdict_hides_nothing_else(toys: Path, tmp_path: Path):
+    content = bytearray(toys.read_bytes())
+    content[offsets(content, Opcode.METADATA)[1] + 4] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    recording = Recording(tmp_path / "damaged.mcap")
+    assert not recording.torn
+    assert len(recording.messages) == 51
 
 
 @pytest.mark.parametrize(
