@@ -361,6 +361,17 @@ class SpoilingFile:
         return getattr(self._file, name)
 
 
+def test_a_recording_that_is_moved_while_it_is_written_is_complete(tmp_path: Path):
+    path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    recorder = RecordingWriter(manifest(graph, path), print)
+    path.rename(moved)
+    path.write_bytes(b"of somebody else")
+    for one in ToyRun(graph, tmp_path).records():
+        put(recorder, one)
+    assert recorder.close() == Recording(moved).verdict == Completeness(True)
+
+
 def test_a_recording_that_is_deleted_while_it_is_written_is_not_complete(tmp_path: Path):
     recorder = writer(tmp_path / "deleted.mcap")
     (tmp_path / "deleted.mcap").unlink()
