@@ -576,6 +576,20 @@ def test_a_killed_recorder_loses_no_more_than_the_last_moments(tmp_path: Path):
     assert recording.torn
 
 
+def test_a_recording_that_grows_is_called_that_and_not_torn(tmp_path: Path):
+    path = tmp_path / "growing.mcap"
+    recorder, flushed = writer(path), threading.Event()
+    put(recorder, number(0))
+    recorder.after_flush(flushed.set)
+    assert flushed.wait(10)
+    text = describe(path)
+    assert text.startswith(f"{path}: INCOMPLETE: is still being written\n")
+    assert "counter/number" in text
+    assert "damage" not in text
+    recorder.close()
+    assert "still being written" not in describe(path)
+
+
 def test_follows_a_recording_until_its_writer_lets_go(tmp_path: Path):
     path = tmp_path / "growing.mcap"
     recorder = writer(path)
