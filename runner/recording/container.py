@@ -274,22 +274,27 @@ def open_file(path: Path) -> IO[bytes]:
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Generator[IO[bytes]]:
-    """A file to write that has its name only once all of it is written; a kill leaves ``PATH.part``.
+    """A file to write that has its name only once all of it is written; a kill leaves ``PATH.PID.part``.
 
-    Raises Refused where the name is taken or writing fails.
+    Raises Refused where the name is taken, also meanwhile, or writing fails.
     """
-    part = path.with_name(f"{path.name}.part")
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        if path.exists():
-            raise Refused(f"{path}: cannot be written: File exists")
-        with part.open("wb") as file:
-            yield file
-        part.rename(path)
+        _require_free(path)
+        with contextlib.ExitStack() as unfinished:
+            with part.open("xb") as file:
+                unfinished.callback(part.unlink)
+                yield file
+            _require_free(path)
+            part.rename(path)
+            unfinished.pop_all()
     except OSError as error:
         raise Refused(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
+
+
+def _require_free(path: Path) -> None:
+    if os.path.lexists(path):
+        raise Refused(f"{path}: cannot be written: File exists")
 
 
 def recordings_in(folder: Path) -> list[Path]:
