@@ -263,6 +263,8 @@ def _reason(error: Exception) -> str:
 def open_file(path: Path) -> IO[bytes]:
     """Opens a recording for reading; raises Refused naming the recordings beside it where that fails."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise Refused(f"{path}: is no regular file: a recording is read more than once")
         return path.open("rb")
     except IsADirectoryError:
         raise Refused(f"{path}: is a directory; {_beside(path)}") from None
@@ -298,11 +300,12 @@ def _require_free(path: Path) -> None:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Recordings, the one that was written last first; without what is not there, as the end of a dead link."""
+    """Recordings, the one that was written last first; without what is no file, as the end of a dead link."""
     written: dict[Path, float] = {}
     for path in folder.glob("*.mcap"):
         with contextlib.suppress(OSError):
-            written[path] = path.stat().st_mtime
+            if path.is_file():
+                written[path] = path.stat().st_mtime
     return sorted(written, key=written.__getitem__, reverse=True)
 
 

@@ -560,6 +560,16 @@ def test_refuses_a_foreign_mcap_a_missing_file_and_a_folder(toys: Path, tmp_path
         Recording(tmp_path)
 
 
+def test_refuses_what_is_no_regular_file(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    reading, writing = os.pipe()
+    for path in (tmp_path / "pipe.mcap", Path(f"/dev/fd/{reading}"), Path("/dev/null")):
+        with pytest.raises(Refused, match=f"{path}: is no regular file: a recording is read more than once"):
+            Recording(path)
+    os.close(reading)
+    os.close(writing)
+
+
 # ------------------------------------------------------------------------------------ while it grows
 
 
