@@ -487,6 +487,12 @@ def test_a_summary_that_is_not_what_was_written_is_damage_and_no_word_of_it_hold
     assert str(Recording(target).verdict) == str(recording.verdict)
 
 
+def test_a_summary_without_a_checksum_is_damage(toys: Path, tmp_path: Path):
+    content = toys.read_bytes()
+    (tmp_path / "damaged.mcap").write_bytes(content[:-20] + bytes(12) + content[-8:])
+    assert "the checksum of the summary" in str(Recording(tmp_path / "damaged.mcap").verdict)
+
+
 def test_a_topic_that_a_damaged_chunk_names_is_taken_from_elsewhere(toys: Path, tmp_path: Path):
     path = rewrite(toys, tmp_path / "damaged.mcap", lambda _, data: data, compression=CompressionType.NONE)
     content = bytearray(path.read_bytes())
