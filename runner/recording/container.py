@@ -21,6 +21,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Metadata, Metad
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import MAGIC_SIZE, CRCValidationError, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
 
 from runner.contract import Refused
 
@@ -43,7 +44,7 @@ _KINDS: dict[int, type[Channel | Schema | Chunk | ChunkIndex | Metadata | Metada
 }
 """Other records that are read."""
 
-BROKEN = (McapError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
+BROKEN = (McapError, ZstdError, ValueError, RuntimeError, KeyError, MemoryError, OverflowError, struct.error)
 """What the MCAP reader and its decompressors raise on bytes that make no sense."""
 
 

@@ -493,6 +493,15 @@ def test_a_summary_without_a_checksum_is_damage(toys: Path, tmp_path: Path):
     assert "the checksum of the summary" in str(Recording(tmp_path / "damaged.mcap").verdict)
 
 
+def test_damage_to_a_chunk_of_a_recovered_file_is_a_report(toys: Path, tmp_path: Path):
+    _, path = recover(toys, tmp_path / "clean.mcap")
+    content = path.read_bytes()
+    begin = offsets(content, Opcode.CHUNK)[0]
+    for at in range(begin, begin + 3000, 50):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :])
+        assert "INCOMPLETE: damaged at byte " in describe(path)
+
+
 def test_a_topic_that_a_damaged_chunk_names_is_taken_from_elsewhere(toys: Path, tmp_path: Path):
     path = rewrite(toys, tmp_path / "damaged.mcap", lambda _, data: data, compression=CompressionType.NONE)
     content = bytearray(path.read_bytes())
