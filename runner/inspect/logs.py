@@ -49,7 +49,7 @@ def printed_lines(recording: Path, stage: str) -> Iterator[tuple[str, str]]:
 
 
 def newest_recording(folder: Path) -> Path:
-    """The recording that was begun last; raises Refused where there is none."""
+    """The recording that was written last; raises Refused where there is none."""
     found = recordings_in(folder)
     if not found:
         raise Refused(f"{folder}: no recordings; start a graph: runner up GRAPH, or name a folder: --recordings DIR")

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.records import Metadata
 
 from runner.contract import Refused
-from runner.recording.container import BROKEN, Container, is_being_written
+from runner.recording.container import BROKEN, Container, is_being_written, recordings_in
 from runner.recording.recording import RUN, VERDICT
 
 
@@ -31,7 +31,7 @@ class PastRun(msgspec.Struct, frozen=True):
 
 def past_runs(folder: Path) -> list[PastRun]:
     """Every recording in a folder that can be read, the newest first."""
-    found = filter(None, map(_read, folder.glob("*.mcap")))
+    found = filter(None, map(_read, recordings_in(folder)))
     return sorted(found, key=lambda run: run.started, reverse=True)
 
 

@@ -18,7 +18,7 @@ from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open_envelope, unpack
 from runner.message.ids import IdText, MessageId
-from runner.recording.container import Container, Entry, open_file
+from runner.recording.container import Container, Entry, is_being_written, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short, to_enter
 from runner.recording.provenance import fingerprint, numerical
@@ -159,6 +159,7 @@ class Recording:
         self._misplaced: dict[str, None] = {}
         """Findings: metadata that does not stand where it was written."""
         with open_file(path) as file:
+            growing = is_being_written(file)
             self._read(Container(file, str(path)))
             if self.container.unknown:
                 file.seek(0)
@@ -166,6 +167,10 @@ class Recording:
                 self._read(Container(file, str(path), self.container))
         self.damage, self.torn = self.container.damage, self.container.torn
         """Places that do not hold what was written there, as ``byte 4711: reason``; whether the end is missing."""
+        self._growing = growing and self.torn
+        """Whether the end is still to be written."""
+        if self._growing:
+            self.damage.pop()
         if RUN not in self.metadata:
             damaged = f" ({self.damage[0]})" if self.damage else ""
             raise Refused(f"{path}: not a recording of this runner: no {RUN!r} metadata{damaged}")
@@ -200,7 +205,7 @@ class Recording:
         written = self.metadata.get(VERDICT, {"verdict": "INCOMPLETE", "reason": "the recorder wrote no verdict"})
         counts = decoded(written.get("counts", ""), dict[str, int]) if VERDICT in self.metadata else None
         reason, run = self._breakage or written.get("reason", ""), written.get("run", "")
-        if self._steps_only:
+        if self._steps_only or self._growing:
             return Completeness(False, (), reason, counts, run)
         proof, found = self._prove(), ""
         missing = proof.missing()
@@ -313,12 +318,13 @@ class Recording:
 
     @property
     def _breakage(self) -> str:
+        if self._growing:
+            return "is still being written"
         if self.torn:
             return f"torn at {self.damage[-1]}"
-        if self.damage:
-            return f"damaged at {self.damage[0]}"
-        written = self.metadata.get(VERDICT, {}).get("run", "")
-        return f"metadata {RUN!r} is not what was written" if written not in ("", hash_of(self.run)) else ""
+        if self.metadata.get(VERDICT, {}).get("run", "") not in ("", hash_of(self.run)):
+            return f"metadata {RUN!r} is not what was written"
+        return f"damaged at {self.damage[0]}" if self.damage else ""
 
     @property
     def _says_ends(self) -> bool:

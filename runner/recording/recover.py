@@ -31,7 +31,7 @@ def recover(path: Path, target: Path | None = None) -> tuple[Recording, Path]:
 
 def _copy(recording: Recording, output: IO[bytes]) -> None:
     verdict = recording.verdict
-    writer = Writer(output, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer = Writer(output, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile=PROFILE)
     channels = {number: _register(recording.container, number, writer) for number in recording.container.channels}
     for record in recording.records():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -138,12 +139,15 @@ class RecordingWriter:
         self._complain = complain
         self._steps_only = manifest.steps_only
         self._topics = manifest.topics
-        self._path = Path(manifest.path)
+        path = Path(manifest.path)
         self._proof = Proof(json.loads(manifest.graph))
         self._proving = threading.Lock()
-        self._file = _create(self._path)
-        self._index_file = tempfile.TemporaryFile(buffering=0, dir=self._path.parent)  # noqa: SIM115 - see _write_all
-        self._writer = Writer(self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4)  # see _flush
+        self._file = _create(path)
+        self._index_file = tempfile.TemporaryFile(buffering=0, dir=path.parent)  # noqa: SIM115 - see _write_all
+        # A chunk ends in _flush.
+        self._writer = Writer(
+            self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4, enable_data_crcs=True
+        )
         own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
         vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
         self._writer.start(profile=PROFILE)
@@ -151,7 +155,7 @@ class RecordingWriter:
         self._run_hash = hash_of(run)
         self._writer.add_metadata(RUN, run)
         self._writer.flush()
-        self._container = Container(self._file, str(self._path))
+        self._container = Container(self._file, str(path))
         """Knows the channels that have been read back."""
         self._proved = MAGIC_SIZE
         """How much of the file has been."""
@@ -291,7 +295,10 @@ class RecordingWriter:
         self._proved = end
 
     def _read_back(self, end: int) -> Iterator[tuple[str, int, Record, int]]:
-        with self._path.open("rb") as file:
+        written = Path(f"/proc/self/fd/{self._file.fileno()}")  # wherever it has been moved to
+        if not written.stat().st_nlink:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        with written.open("rb") as file:
             for entry in self._container.entries_at(file, self._proved, end):
                 with contextlib.suppress(CodecError):  # of a chunk that is damaged, which the container notes
                     record = unpack(payload_kind(entry.topic), entry.message.data)

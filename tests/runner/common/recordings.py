@@ -1,5 +1,6 @@
 """Makes recordings of the toy graph without processes: the same steps, journal and writer as in a run."""
 
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -7,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.stream_reader import MAGIC_SIZE
+from mcap.writer import CompressionType, Writer
 
 from runner.graph.graph import SUPERVISOR, Graph, graph_to_json
 from runner.graph.reading import load_graph
@@ -118,13 +121,27 @@ class ToyRun:
         return msgspec.structs.replace(step, **fields)
 
 
+def offsets(content: bytes | bytearray, opcode: Opcode) -> list[int]:
+    """Where the records of a kind begin in an MCAP file."""
+    at, found = MAGIC_SIZE, list[int]()
+    while at < len(content) - MAGIC_SIZE:
+        kind, length = struct.unpack_from("<BQ", content, at)
+        found += [at] if kind == opcode else []
+        at += 9 + length
+    return found
+
+
 def rewrite(
-    source: Path, target: Path, change: Callable[[str, bytes], bytes], aspects: Mapping[str, str] | None = None
+    source: Path,
+    target: Path,
+    change: Callable[[str, bytes], bytes],
+    aspects: Mapping[str, str] | None = None,
+    compression: CompressionType = CompressionType.ZSTD,
 ) -> Path:
     """Copies a recording; ``change`` gets each topic and payload and returns what is kept in its place, ``aspects``
     replace what its metadata says of the run."""
     with source.open("rb") as file, target.open("wb") as output:
-        reader, writer = make_reader(file), Writer(output)
+        reader, writer = make_reader(file), Writer(output, compression=compression)
         writer.start()
         metadata = {found.name: found.metadata for found in reader.iter_metadata()}
         run = {**metadata.pop(RUN), **(aspects or {})}

@@ -1,5 +1,6 @@
 """Why, how long and what differs: the commands that look into a recording."""
 
+import os
 import random
 from itertools import pairwise
 from pathlib import Path
@@ -57,6 +58,8 @@ def test_the_tree_leads_back_to_the_start_of_the_lineage_with_every_hop(toys: Pa
 
 def test_the_newest_recording_is_the_default(toys: Path, capsys: pytest.CaptureFixture[str]):
     (toys.parent / "dead.mcap").symlink_to("absent.mcap")
+    (toys.parent / "folder.mcap").mkdir()
+    os.mkfifo(toys.parent / "pipe.mcap")
     assert main(["why", "counter.number#0", "--recordings", str(toys.parent)]) == 0
     assert "counter.number#0  Number" in capsys.readouterr().out
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import shutil
 import threading
 from pathlib import Path
 
@@ -10,6 +12,16 @@ import pytest
 
 from runner.contract import Refused
 from runner.page import past
+from runner.page.history import past_runs
+
+OLD = Path(__file__).parents[1] / "weather-1.mcap"
+
+
+def test_what_is_no_file_is_no_past_run(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "folder.mcap").mkdir()
+    shutil.copy(OLD, tmp_path)
+    assert [run.name for run in past_runs(tmp_path)] == ["weather-1"]
 
 
 def test_a_recording_is_read_once_for_all_who_wait_and_the_newest_are_kept(

@@ -3,6 +3,7 @@ import io
 import json
 import os
 import shutil
+import struct
 import threading
 import time
 from collections import Counter
@@ -16,21 +17,25 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from runner.contract import Refused
 from runner.graph.reading import load_graph
 from runner.inspect.info import describe
 from runner.message.codec import Envelope, LogLine, Step, envelope, open_envelope
+from runner.message.ids import MessageId
 from runner.recording import writer as writer_module
 from runner.recording.container import Container, Growing, is_being_written
 from runner.recording.provenance import file_hashes
 from runner.recording.recording import Completeness, Recording
+from runner.recording.recover import recover
 from runner.recording.writer import RecordingWriter
-from tests.runner.common.recordings import TOYS, ToyRun, manifest, put, record, record_toys
+from tests.runner.common.recordings import TOYS, ToyRun, manifest, offsets, put, record, record_toys, rewrite
 from tests.runner.common.toys import Number, Total
 
+TOPICS = {"counter/number", "splitter/piece", "worker/answer", "gatherer/total", "sink/finished"}
 FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -54,15 +59,20 @@ def number(sequence: int) -> Envelope:
 # ------------------------------------------------------------------------------------ content
 
 
-def test_the_index_at_the_end_names_every_chunk_and_grows_by_bytes_only(tmp_path: Path):
-    recorder = writer(tmp_path / "a.mcap")
-    for sequence in range(3):
+def in_chunks(path: Path, count: int) -> Path:
+    """A recording of so many messages, each in a chunk of its own."""
+    recorder = writer(path)
+    for sequence in range(count):
         flushed = threading.Event()
         put(recorder, number(sequence))
         recorder.after_flush(flushed.set)
         assert flushed.wait(10)
     recorder.close()
-    with (tmp_path / "a.mcap").open("rb") as file:
+    return path
+
+
+def test_the_index_at_the_end_names_every_chunk_and_grows_by_bytes_only(tmp_path: Path):
+    with in_chunks(tmp_path / "a.mcap", 3).open("rb") as file:
         summary = make_reader(file).get_summary()
         found = [message.sequence for _, _, message in make_reader(file).iter_messages(topics=["counter/number"])]
     assert summary is not None and summary.statistics is not None
@@ -351,6 +361,17 @@ class SpoilingFile:
         return getattr(self._file, name)
 
 
+def test_a_recording_that_is_moved_while_it_is_written_is_complete(tmp_path: Path):
+    path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
+    recorder = RecordingWriter(manifest(graph, path), print)
+    path.rename(moved)
+    path.write_bytes(b"of somebody else")
+    for one in ToyRun(graph, tmp_path).records():
+        put(recorder, one)
+    assert recorder.close() == Recording(moved).verdict == Completeness(True)
+
+
 def test_a_recording_that_is_deleted_while_it_is_written_is_not_complete(tmp_path: Path):
     recorder = writer(tmp_path / "deleted.mcap")
     (tmp_path / "deleted.mcap").unlink()
@@ -388,15 +409,34 @@ def test_a_cut_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path
         assert "\n" not in str(refused)
 
 
+def test_a_file_that_goes_on_after_its_end_is_not_complete(toys: Path, tmp_path: Path):
+    content, path = toys.read_bytes(), tmp_path / "long.mcap"
+    for more in (b"\n", content):
+        path.write_bytes(content + more)
+        verdict = Recording(path).verdict
+        assert str(verdict) == f"INCOMPLETE: damaged at byte {len(content)}: the file goes on after its end"
+
+
+@pytest.mark.parametrize("recovered", [False, True])
+def test_where_messages_lie_is_under_a_checksum_too(toys: Path, tmp_path: Path, recovered: bool):
+    path, damaged = recover(toys, tmp_path / "a.mcap")[1] if recovered else toys, tmp_path / "b.mcap"
+    assert Recording(path).verdict.complete
+    content = bytearray(path.read_bytes())
+    (end,) = offsets(content, Opcode.DATA_END)
+    content[offsets(content, Opcode.MESSAGE_INDEX)[1] - 1] ^= 1
+    damaged.write_bytes(content)
+    assert Recording(damaged).damage == [f"byte {end}: the checksum of the data section does not match its content"]
+
+
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @FEW
-def test_a_flipped_bit_anywhere_is_a_report_or_one_clear_line(toys: Path, tmp_path: Path, share: float, bit: int):
+def test_a_flipped_bit_anywhere_is_found_or_one_clear_line(toys: Path, tmp_path: Path, share: float, bit: int):
     content = bytearray(toys.read_bytes())
     content[int(share * len(content))] ^= 1 << bit
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
     try:
-        describe(damaged)
+        assert f"{damaged}: INCOMPLETE" in describe(damaged)
         for sealed in Recording(damaged).envelopes():
             assert sealed.id
     except Refused as refused:
@@ -433,6 +473,82 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path: Path):
     assert not recording.verdict.complete
 
 
+def test_a_summary_that_is_not_what_was_written_is_damage_and_no_word_of_it_holds(toys: Path, tmp_path: Path):
+    content, damaged = toys.read_bytes(), tmp_path / "damaged.mcap"
+    summary, offsets = struct.unpack_from("<QQ", content, len(content) - 28)
+    for at in (*range(summary + 9, offsets, 211), content.index(b"worker/answer", summary)):
+        damaged.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+        recording = Recording(damaged)
+        assert not recording.verdict.complete, at
+        assert {message.topic for message in recording.messages.values()} == TOPICS
+    assert recording.damage == [f"byte {len(content) - 37}: the checksum of the summary does not match its content"]
+    _, target = recover(damaged, tmp_path / "clean.mcap")
+    assert {message.topic for message in Recording(target).messages.values()} == TOPICS
+    assert str(Recording(target).verdict) == str(recording.verdict)
+
+
+def test_a_summary_without_a_checksum_is_damage(toys: Path, tmp_path: Path):
+    content = toys.read_bytes()
+    (tmp_path / "damaged.mcap").write_bytes(content[:-20] + bytes(12) + content[-8:])
+    assert "the checksum of the summary" in str(Recording(tmp_path / "damaged.mcap").verdict)
+
+
+def test_damage_to_a_chunk_of_a_recovered_file_is_a_report(toys: Path, tmp_path: Path):
+    _, path = recover(toys, tmp_path / "clean.mcap")
+    content = path.read_bytes()
+    begin = offsets(content, Opcode.CHUNK)[0]
+    for at in range(begin, begin + 3000, 50):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :])
+        assert "INCOMPLETE: damaged at byte " in describe(path)
+
+
+def test_a_topic_that_a_damaged_chunk_names_is_taken_from_elsewhere(toys: Path, tmp_path: Path):
+    path = rewrite(toys, tmp_path / "damaged.mcap", lambda _, data: data, compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"worker/answer")] ^= 1
+    for cut, topics in ((None, TOPICS), (content.index(b"COMPLETE"), TOPICS - {"worker/answer"} | {"vorker/answer"})):
+        path.write_bytes(content[:cut])
+        recording = Recording(path)
+        assert "the chunk's checksum does not match" in recording.damage[0]
+        assert len(recording.messages) == 51
+        assert {message.topic for message in recording.messages.values()} == topics
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX])
+@pytest.mark.parametrize("which", [0, 2, 5])
+def test_damage_to_a_frame_costs_no_more_than_its_chunk(tmp_path: Path, opcode: Opcode, which: int):
+    content = in_chunks(tmp_path / "whole.mcap", 6).read_bytes()
+    path, at = tmp_path / "damaged.mcap", offsets(content, opcode)[which]
+    lengths = [(at + 1 + bit // 8, bytes([content[at + 1 + bit // 8] ^ 1 << bit % 8])) for bit in range(0, 64, 5)]
+    for begin, damage in (*lengths, (at - (20 if which else 0), bytes(30)), (at, b"\0")):
+        path.write_bytes(content[:begin] + damage + content[begin + len(damage) :])
+        recording = Recording(path)
+        assert not recording.verdict.complete
+        assert not recording.torn
+        assert {0, 1, 2, 3, 4, 5} - {which} <= {sealed.sequence for sealed in map(MessageId.of, recording.messages)}
+        assert [sealed.id for sealed in recording.envelopes()] == list(recording.messages)
+        assert {"run", "verdict"} == set(recording.metadata)
+
+
+def test_damage_to_a_frame_costs_what_follows_where_nothing_says_how_it_goes_on(tmp_path: Path):
+    content = bytearray(in_chunks(tmp_path / "whole.mcap", 3).read_bytes())
+    content[offsets(content, Opcode.CHUNK)[1] + 3] ^= 1
+    content[-12] ^= 1  # of the checksum of the summary
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    recording = Recording(tmp_path / "damaged.mcap")
+    assert recording.torn
+    assert list(recording.messages) == ["counter.number#0"]
+
+
+def test_damage_to_the_verdict_hides_nothing_else(toys: Path, tmp_path: Path):
+    content = bytearray(toys.read_bytes())
+    content[offsets(content, Opcode.METADATA)[1] + 4] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    recording = Recording(tmp_path / "damaged.mcap")
+    assert not recording.torn
+    assert len(recording.messages) == 51
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [(b"", "empty or cut off"), (b"\x89MC", "empty or cut off"), (b"name: toys\nseed: 7\n", "not an MCAP file")],
@@ -459,6 +575,16 @@ def test_refuses_a_foreign_mcap_a_missing_file_and_a_folder(toys: Path, tmp_path
         Recording(tmp_path)
 
 
+def test_refuses_what_is_no_regular_file(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    reading, writing = os.pipe()
+    for path in (tmp_path / "pipe.mcap", Path(f"/dev/fd/{reading}"), Path("/dev/null")):
+        with pytest.raises(Refused, match=f"{path}: is no regular file: a recording is read more than once"):
+            Recording(path)
+    os.close(reading)
+    os.close(writing)
+
+
 # ------------------------------------------------------------------------------------ while it grows
 
 
@@ -473,6 +599,20 @@ def test_a_killed_recorder_loses_no_more_than_the_last_moments(tmp_path: Path):
     recording = Recording(copy)
     assert list(recording.messages)[:1] == ["counter.number#0"]
     assert recording.torn
+
+
+def test_a_recording_that_grows_is_called_that_and_not_torn(tmp_path: Path):
+    path = tmp_path / "growing.mcap"
+    recorder, flushed = writer(path), threading.Event()
+    put(recorder, number(0))
+    recorder.after_flush(flushed.set)
+    assert flushed.wait(10)
+    text = describe(path)
+    assert text.startswith(f"{path}: INCOMPLETE: is still being written\n")
+    assert "counter/number" in text
+    assert "damage" not in text
+    recorder.close()
+    assert "still being written" not in describe(path)
 
 
 def test_follows_a_recording_until_its_writer_lets_go(tmp_path: Path):

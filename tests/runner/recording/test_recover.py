@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from runner.cli.main import main
 from runner.contract import Refused
 from runner.message.codec import Step, envelope, pack
-from runner.recording.container import is_being_written
+from runner.recording.container import is_being_written, new_file
 from runner.recording.recording import Recording
 from runner.recording.recover import recover
 from runner.supervise.supervisor import EXIT_INCOMPLETE
@@ -117,6 +117,25 @@ def test_nothing_is_overwritten_and_nothing_that_still_grows_is_copied(toys: Pat
     with pytest.raises(Refused, match="still being written"):
         recover(session.path)
     session.stop()
+
+
+def test_files_of_others_beside_the_new_one_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path, foreign = tmp_path / "a.mcap", tmp_path / "a.mcap.part"
+    foreign.write_bytes(b"foreign")
+    with new_file(path) as file:
+        file.write(b"one")
+    with pytest.raises(Refused, match="File exists"), new_file(path):
+        pass
+    assert {path.name: b"one", foreign.name: b"foreign"} == {one.name: one.read_bytes() for one in tmp_path.iterdir()}
+    path.unlink()
+    monkeypatch.setattr(os, "getpid", iter((1, 2)).__next__)  # of two processes at once
+    with pytest.raises(Refused, match="File exists"), new_file(path) as slower:
+        slower.write(b"slower")
+        with new_file(path) as faster:
+            faster.write(b"faster")
+    assert {path.name: b"faster", foreign.name: b"foreign"} == {
+        one.name: one.read_bytes() for one in tmp_path.iterdir()
+    }
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7, 1.0])
