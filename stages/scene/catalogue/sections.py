@@ -95,6 +95,11 @@ class Section:
         value = self.value(key, [])
         return value if isinstance(value, list) else self._mismatch(key, "a list")
 
+    def texts(self, key: str) -> list[str]:
+        """A list of strings; empty where the key is missing."""
+        values = self.items(key)
+        return values if all(isinstance(value, str) for value in values) else self._mismatch(key, "a list of texts")
+
     def sections(self, key: str) -> Iterator[Section]:
         """A list of mappings; empty where the key is missing."""
         for item in self.items(key):
