@@ -144,7 +144,12 @@ def _convert(node: yaml.Node, file: Path, path: str) -> Any:
         return _mapping(node, file, path)
     if isinstance(node, yaml.SequenceNode):
         return [_convert(item, file, f"{path}[{index}]") for index, item in enumerate(node.value)]
-    return yaml.SafeLoader("").construct_object(node)
+    try:
+        return yaml.SafeLoader("").construct_object(node)
+    except (ValueError, yaml.YAMLError) as error:
+        why = getattr(error, "problem", None) or error
+        place = f"{file}:{node.start_mark.line + 1}: {path}"
+        raise Refused(f"{place}: '{node.value}' is no value, {why}; in quotes it is a text") from error
 
 
 def _mapping(node: yaml.MappingNode, file: Path, path: str) -> Section:
