@@ -51,6 +51,7 @@ class Ranker(Stage):
             support=observation.support,
             lambda_r=best.lambda_r,
             repeated=_repeated(scenes, np.argsort(-log_weights, kind="stable").tolist()),
+            unusable=observation.unusable,
         )
 
     def _named(self, objects: Sequence[ObjectPose], observation: Observation) -> tuple[ObjectPose, ...]:

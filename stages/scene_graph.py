@@ -75,6 +75,7 @@ class SceneGraphBuilder(Stage):
             support=scene_estimate.support,
             doubts=doubts(scene_estimate, self._catalogue) if self._config.doubts else (),
             unknown=scene_estimate.unknown,
+            unusable=scene_estimate.unusable,
         )
 
     def _stances_of(self, label: str) -> Stances:

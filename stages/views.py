@@ -360,6 +360,7 @@ def look_text(estimate: SceneEstimate) -> str:
     sure = "" if estimate.probabilities is None else f", probability {estimate.probabilities[estimate.winner]:.2f}"
     title = f"**Hypothesis {estimate.winner + 1} of {len(estimate.log_weights)} wins{sure}**"
     notes = [f"{estimate.left_out} combinations were left out by the cap."] if estimate.left_out else []
+    notes += [f"Nothing is known: {estimate.unusable}."] if estimate.unusable else []
     notes += [f"Something unknown: {_size(item)}, {item.points} readings." for item in estimate.unknown]
     header = ["| object | sure | spread | fit | seen | |", "|---|---|---|---|---|---|"]
     return "\n".join([title, *(f"\n{note}" for note in notes), "", *header, *map(_look_row, estimate.objects)])

@@ -218,3 +218,5 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """Scale of the weights: each of ``log_weights`` is minus this times a cost, metres times pixels."""
     repeated: tuple[int, ...] = ()
     """Hypotheses that end in the same scene as a heavier one: they have no share in ``probabilities``."""
+    unusable: str = ""
+    """The observation's: why nothing was to be seen; then that there are no objects says nothing of the scene."""

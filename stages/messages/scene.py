@@ -152,6 +152,8 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     """Where somebody is there to be asked."""
     unknown: tuple[UnknownRegion, ...] = ()
     """What stands there and is no object of the scene, as far as it was seen."""
+    unusable: str = ""
+    """Why nothing was to be seen, as :attr:`Observation.unusable`: then no object here is no empty table."""
 
     @property
     def frame(self) -> Literal["base", "table"]:

@@ -71,22 +71,30 @@ class Scenes:
             yield Outgoing("/tf", self._types.new(TF, transforms=[placed]))
 
     def scene(self, estimate: SceneEstimate, graph: SceneGraph, stamp_ns: int) -> Iterator[Outgoing]:
-        """A scene graph and the estimate that it is of."""
+        """A scene graph and the estimate that it is of; of a look at which nothing was to be seen only the JSON, which
+        says why: what was published before still is what is known."""
         where = self._frames.base if graph.frame == "base" else TABLE
-        header = _header(stamp_ns, where)
         estimates = {item.name: item for item in estimate.objects}
-        T_where_camera = graph.T_base_table @ inverse(estimate.T_camera_table)
-        detections = [self._detection(estimates[item.name], T_where_camera, header) for item in graph.objects]
-        yield Outgoing("~/detections", self._types.new(DETECTIONS, header=header, detections=detections))
-        placed = [_placed(where, f"scene/{item.name}", item.T_base_object, stamp_ns) for item in graph.objects]
-        if graph.frame == "table":
-            placed.append(_placed(self._frames.camera, TABLE, estimate.T_camera_table, stamp_ns))
-        yield Outgoing("/tf", self._types.new(TF, transforms=placed))
-        yield Outgoing("~/markers", self._markers(estimates, graph, header))
+        if not graph.unusable:
+            yield from self._seen(estimates, estimate.T_camera_table, graph, where, stamp_ns)
         content = {"stamp_ns": stamp_ns, "frame_id": where, **scene_graph_content(graph)}
         content["labels"] = {item.name: item.label for item in graph.objects}
         content["probabilities"] = {item.name: estimates[item.name].probability for item in graph.objects}
         yield Outgoing("~/scene_graph", self._types.new(STRING, data=json.dumps(content)))
+
+    def _seen(
+        self, estimates: Mapping[str, ObjectPose], T_camera_table: Pose, graph: SceneGraph, where: str, stamp_ns: int
+    ) -> Iterator[Outgoing]:
+        """The objects in the frame ``where``."""
+        header = _header(stamp_ns, where)
+        T_where_camera = graph.T_base_table @ inverse(T_camera_table)
+        detections = [self._detection(estimates[item.name], T_where_camera, header) for item in graph.objects]
+        yield Outgoing("~/detections", self._types.new(DETECTIONS, header=header, detections=detections))
+        placed = [_placed(where, f"scene/{item.name}", item.T_base_object, stamp_ns) for item in graph.objects]
+        if where == TABLE:
+            placed.append(_placed(self._frames.camera, TABLE, T_camera_table, stamp_ns))
+        yield Outgoing("/tf", self._types.new(TF, transforms=placed))
+        yield Outgoing("~/markers", self._markers(estimates, graph, header))
 
     def _image(self, pixels: Any, encoding: str, header: dict[str, Any]) -> Any:
         height, width = pixels.shape[:2]

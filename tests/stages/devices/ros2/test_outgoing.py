@@ -135,6 +135,14 @@ def test_the_scene_graph_is_json(reference: Any) -> None:
     assert (content["frame_id"], content["stamp_ns"]) == ("scene/table", START)
 
 
+def test_of_a_look_at_nothing_only_the_reason_is_told(reference: Any) -> None:
+    _, estimate, graph = reference
+    blind = msgspec.structs.replace(graph, objects=(), assertions=(), virtual_objects=(), unusable="no support plane")
+    (topic, said), *others = told(msgspec.structs.replace(estimate, objects=()), blind).items()
+    assert (topic, others) == ("~/scene_graph", [])
+    assert json.loads(said.data)["unusable"] == "no support plane"
+
+
 def test_a_recording_becomes_a_bag_that_others_read_and_that_is_a_camera_again(
     tmp_path: Path, reference: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
