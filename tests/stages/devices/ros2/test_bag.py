@@ -172,6 +172,14 @@ def test_depth_of_another_frame_is_taken_where_somebody_says_that_it_is_register
     assert np.array_equal(found.depth, DEPTH) and found.T_base_camera == pytest.approx(T_base_camera())
 
 
+def test_frames_are_equal_whether_a_slash_begins_them_or_not(tmp_path: Path) -> None:
+    millimetres = np.round(DEPTH * 1000).astype(np.uint16)
+    slashed = {SOURCE.depth: image(millimetres, "16UC1", frame=f"/{CAMERA}")}
+    path = write_bag(tmp_path / "bag", replaced(looks(RGB, DEPTH, K, T_base_camera(), STAMPS[:1]), slashed))
+    (found,) = frames(path)
+    assert np.array_equal(found.depth, DEPTH)
+
+
 def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
     with pytest.raises(Refused, match=r"none: no such bag; a bag is a folder with metadata.yaml, or a file"):
         frames(tmp_path / "none")
