@@ -105,6 +105,7 @@ class Views:
         # A real camera is calibrated without knowing any objects.
         self._catalogue = Catalogue.load(Path(paths[0])) if paths else Catalogue({})
         self._colors = palette(list(self._catalogue.objects))
+        self._configs = configs
         self._refined = configs.get("refiner", {}).get("form") == "default"
         """A better estimate follows the ranker's."""
         self._frames: dict[tuple[int, int, str], Frame] = {}
@@ -199,7 +200,7 @@ class Views:
     def _recorded(self) -> RecordedScenes:
         from stages.devices.ros2.recorded import RecordedScenes
 
-        return RecordedScenes(self._catalogue)
+        return RecordedScenes(self._catalogue, self._configs)
 
     def _task(self, message: Message) -> Iterator[Drawing]:
         if isinstance(message, Goal):

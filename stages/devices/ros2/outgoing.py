@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from runner.contract import Refused
 from stages.devices.bop_results import scene_graph_content
 from stages.devices.ros2.images import IMAGE
 from stages.devices.ros2.rgbd import INFO, TF
@@ -67,13 +68,13 @@ class Scenes:
             ),
         )
         if frame.T_base_camera is not None:
-            placed = _placed(self._frames.base, self._frames.camera, frame.T_base_camera, stamp_ns)
+            placed = _placed(self._base(), self._frames.camera, frame.T_base_camera, stamp_ns)
             yield Outgoing("/tf", self._types.new(TF, transforms=[placed]))
 
     def scene(self, estimate: SceneEstimate, graph: SceneGraph, stamp_ns: int) -> Iterator[Outgoing]:
         """A scene graph and the estimate that it is of; of a look at which nothing was to be seen only the JSON, which
         says why: what was published before still is what is known."""
-        where = self._frames.base if graph.frame == "base" else TABLE
+        where = self._base() if graph.frame == "base" else TABLE
         estimates = {item.name: item for item in estimate.objects}
         if not graph.unusable:
             yield from self._seen(estimates, estimate.T_camera_table, graph, where, stamp_ns)
@@ -95,6 +96,11 @@ class Scenes:
             placed.append(_placed(self._frames.camera, TABLE, T_camera_table, stamp_ns))
         yield Outgoing("/tf", self._types.new(TF, transforms=placed))
         yield Outgoing("~/markers", self._markers(estimates, graph, header))
+
+    def _base(self) -> str:
+        if self._frames.base is None:
+            raise Refused("frames.base is null, but it is known how the camera stands to the robot: name that frame")
+        return self._frames.base
 
     def _image(self, pixels: Any, encoding: str, header: dict[str, Any]) -> Any:
         height, width = pixels.shape[:2]

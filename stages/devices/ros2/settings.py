@@ -146,8 +146,8 @@ class Care:
 class Frames:
     """Names of frames among the lab's transforms."""
 
-    base: str = "base_link"
-    """What poses are given in, where it is known how the camera stands to the robot."""
+    base: str | None = "base_link"
+    """What poses are given in, where it is known how the camera stands to the robot; None where it never is."""
     camera: str = "camera_color_optical_frame"
     """Of the colour camera; else poses are in the table's frame, which hangs on this one."""
 

@@ -13,11 +13,13 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from runner.cli.main import main
+from runner.contract import Refused
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from runner.testing import run_stage
 from stages.camera import BagCamera
 from stages.devices.ros2.outgoing import Outgoing, Scenes
+from stages.devices.ros2.recorded import RecordedScenes
 from stages.devices.ros2.settings import Frames, Source
 from stages.messages import Frame, ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import Alternative
@@ -115,6 +117,31 @@ def test_transforms_hang_on_the_base_or_on_the_camera(reference: Any) -> None:
     z = table.transform.translation.z
     assert z == pytest.approx(estimate.T_camera_table[2, 3])
     assert {one.header.frame_id for one in placed.values()} == {"scene/table"}
+
+
+def test_a_recordings_frames_are_those_of_its_graph(reference: Any) -> None:
+    _, estimate, graph = reference
+    published = {"ros2": {"frames": {"base": "base", "camera": "eye"}}}
+    heard = {"camera": {"topics": {"base_frame": "map"}}}
+    for configs, base, camera in (
+        (heard | published, "base", "eye"),
+        (heard, "map", "camera_color_optical_frame"),
+        ({"camera": {}}, "base_link", "camera_color_optical_frame"),
+    ):
+        for scene, frame in ((in_base(estimate, graph), base), ((estimate, graph), camera)):
+            recorded = RecordedScenes(Catalogue.shared(BUILT_IN), configs)
+            frame_message = msgspec.structs.replace(reference[0], T_base_camera=scene[0].T_base_camera)
+            told = [one for message in (frame_message, *scene) for one in recorded.told(message, START)]
+            placed = [TYPES.decode(one.data, one.type).transforms for one in told if one.topic == "/tf"]
+            assert frame in {one.header.frame_id for transforms in placed for one in transforms}
+
+
+def test_poses_in_a_base_without_a_name_are_refused(reference: Any) -> None:
+    _, estimate, graph = reference
+    scenes = Scenes(TYPES, Catalogue.shared(BUILT_IN), Frames(base=None))
+    assert list(scenes.scene(estimate, graph, START))
+    with pytest.raises(Refused, match=r"frames\.base is null, but it is known how the camera stands to the robot"):
+        list(scenes.scene(*in_base(estimate, graph), START))
 
 
 def test_markers_are_meshes_with_names_and_replace_the_last_scene(reference: Any) -> None:
