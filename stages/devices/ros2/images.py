@@ -79,6 +79,8 @@ def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
     """H x W x channels; lines may be longer than their pixels."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     used = width * channels * dtype.itemsize
+    if not width or not height:
+        raise ValueError(f"an image of {width} x {height} pixels")
     if step < used or len(message.data) < height * step:
         raise ValueError(
             f"{len(message.data)} bytes in lines of {step} do not hold {width} x {height} pixels of {message.encoding}"

@@ -72,6 +72,7 @@ def words(*packed: int) -> Any:
     [
         (color, image(MILLIMETRES, "mono16"), "encoding 'mono16' is no colour that is read; valid: rgb8, bgr8"),
         (depth, image(RGB, "rgb8"), "encoding 'rgb8' is no depth that is read; valid: 16UC1"),
+        (color, image(RGB[:, :0], "rgb8"), "an image of 0 x 4 pixels"),
         (color, compressed(b"nothing", "jpeg"), "7 bytes of format 'jpeg' are no image"),
         (depth, compressed(b"", "jpeg"), "format 'jpeg' is no depth that is read"),
         (depth, compressed(bytes(12), "16UC1; compressedDepth png"), "0 bytes of format"),
