@@ -53,7 +53,7 @@ def _frames(configs: Mapping[str, Mapping[str, Any]]) -> Frames:
     """Those under which a graph publishes; where it does not, the base among its camera's transforms."""
     groups = [group for config in configs.values() for group in config.values() if isinstance(group, Mapping)]
     for group in groups:
-        if group.keys() == {"base", "camera"}:
+        if set(group) == {"base", "camera"}:
             return Frames(**group)
     bases = [group["base_frame"] for group in groups if "base_frame" in group]
     return Frames(base=bases[0]) if bases else Frames()
