@@ -56,6 +56,7 @@ class Ranker(Stage):
             lambda_r=best.lambda_r,
             repeated=_repeated(scenes, np.argsort(-log_weights, kind="stable").tolist()),
             contested=_contested(scenes[winner], scenes),
+            unusable=observation.unusable,
         )
 
     def _named(self, objects: Sequence[ObjectPose], observation: Observation) -> tuple[ObjectPose, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,16 +21,23 @@ class SceneGraphs(Stage):
 
     def __init__(self) -> None:
         self._written = 0
+        self._unusable: list[str] = []
+        """Of looks at which nothing was to be seen: why."""
 
     def on_scene_graph(
         self, frame: Frame, scene_estimate: SceneEstimate, scene_graph: SceneGraph, ctx: Context
     ) -> Finished | None:
         """One look: what stands on what, and how sure that is."""
         write_scene_graph(ctx.directory / f"look-{frame.index:04d}.json", scene_graph)
-        ctx.log("\n".join([f"{frame.name}{_said(scene_estimate)}", *tree(scene_graph)]))
+        said = f"{frame.name}{_said(scene_estimate)}"
+        if scene_graph.unusable:
+            self._unusable.append(scene_graph.unusable)
+            ctx.log(said, level="warning")
+        else:
+            ctx.log("\n".join([said, *tree(scene_graph)]))
         self._written += 1
         if self._written == frame.total:
-            return Finished(code=0, reason=f"looks: {self._written}, scene graphs in {ctx.directory}")
+            return _finished(f"looks: {self._written}, scene graphs in {ctx.directory}", self._unusable)
         return None
 
 
@@ -61,6 +69,8 @@ class BopResults(Stage):
         except OSError as error:
             raise Refused(f"results.path: cannot write '{self._path}' ({error.strerror})") from error
         self._written = 0
+        self._unusable: list[str] = []
+        """Of images in which nothing was to be seen: why."""
         self._newest: float | None = None
 
     def on_scene_graph(
@@ -76,19 +86,28 @@ class BopResults(Stage):
             file.writelines(f"{result.line()}\n" for result in results)
         write_scene_graph(self._graphs / f"{frame.scene_id:06d}_{frame.image_id:06d}.json", scene_graph)
         self._written += 1
+        self._unusable += [scene_graph.unusable] if scene_graph.unusable else []
         names = ", ".join(item.name for item in scene_estimate.objects) or "no objects"
         ctx.log(
             f"{frame.name or frame.image_id}: {names} (hypothesis {scene_estimate.winner + 1} of "
-            f"{len(scene_estimate.log_weights)}{f', {seconds:.1f} s' if seconds > 0 else ''}{_said(scene_estimate)})"
+            f"{len(scene_estimate.log_weights)}{f', {seconds:.1f} s' if seconds > 0 else ''}{_said(scene_estimate)})",
+            level="warning" if scene_graph.unusable else "info",
         )
         if self._written == frame.total:
-            return Finished(code=0, reason=f"{self._written} images, results in {self._path}")
+            return _finished(f"{self._written} images, results in {self._path}", self._unusable)
         return None
 
     def _seconds(self) -> float:
         """Wall time since the image before, -1 for the first: images overlap, so this is the time each one adds."""
         before, self._newest = self._newest, time.monotonic()
         return -1.0 if before is None else self._newest - before
+
+
+def _finished(done: str, unusable: Sequence[str]) -> Finished:
+    """Failed where nothing was to be seen in an image: that it has no objects says nothing of its scene."""
+    if not unusable:
+        return Finished(code=0, reason=done)
+    return Finished(code=1, reason=f"{done}; nothing is known of {len(unusable)} of them: {'; '.join(unusable[:2])}")
 
 
 def _said(estimate: SceneEstimate) -> str:

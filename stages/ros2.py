@@ -80,11 +80,12 @@ class Ros2Scenes(Stage):
     ) -> Ros2Sent:
         """Publishes a scene, and answers who asked for it."""
         sent = self._outlet.publish(frame, scene_estimate, scene_graph, ctx)
-        text = sentence(scene_graph)
-        ctx.log(f"{frame.name}: {text}")
+        reason = scene_graph.unusable
+        text = f"nothing is known: {reason}" if reason else sentence(scene_graph)
+        ctx.log(f"{frame.name}: {text}", level="warning" if reason else "info")
         request = self._waiting.pop(frame.name, None)
         if request is not None:
-            sent.append(self._outlet.answer(request, success=True, message=text))
+            sent.append(self._outlet.answer(request, success=not reason, message=text))
         if self._every is not None:
             self._due_ns = ctx.time_ns + int(self._every * 1e9)
         return Ros2Sent(messages=tuple(sent))

@@ -76,6 +76,7 @@ class SceneGraphBuilder(Stage):
             doubts=doubts(scene_estimate, self._catalogue) if self._config.doubts else (),
             unknown=scene_estimate.unknown,
             contested=scene_estimate.contested,
+            unusable=scene_estimate.unusable,
         )
 
     def _stances_of(self, label: str) -> Stances:

@@ -105,6 +105,7 @@ class Views:
         # A real camera is calibrated without knowing any objects.
         self._catalogue = Catalogue.load(Path(paths[0])) if paths else Catalogue({})
         self._colors = palette(list(self._catalogue.objects))
+        self._configs = configs
         self._refined = configs.get("refiner", {}).get("form") == "default"
         """A better estimate follows the ranker's."""
         self._frames: dict[tuple[int, int, str], Frame] = {}
@@ -199,7 +200,7 @@ class Views:
     def _recorded(self) -> RecordedScenes:
         from stages.devices.ros2.recorded import RecordedScenes
 
-        return RecordedScenes(self._catalogue)
+        return RecordedScenes(self._catalogue, self._configs)
 
     def _task(self, message: Message) -> Iterator[Drawing]:
         if isinstance(message, Goal):
@@ -360,6 +361,7 @@ def look_text(estimate: SceneEstimate) -> str:
     sure = "" if estimate.probabilities is None else f", probability {estimate.probabilities[estimate.winner]:.2f}"
     title = f"**Hypothesis {estimate.winner + 1} of {len(estimate.log_weights)} wins{sure}**"
     notes = [f"{estimate.left_out} combinations were left out by the cap."] if estimate.left_out else []
+    notes += [f"Nothing is known: {estimate.unusable}."] if estimate.unusable else []
     notes += [f"Something unknown: {_size(item)}, {item.points} readings." for item in estimate.unknown]
     header = ["| object | sure | spread | fit | seen | |", "|---|---|---|---|---|---|"]
     return "\n".join([title, *(f"\n{note}" for note in notes), "", *header, *map(_look_row, estimate.objects)])

@@ -33,3 +33,14 @@ def test_a_bag_gives_a_scene_graph_for_each_look(tmp_path: Path, storage: Litera
     assert graph.frame == "base"
     (written,) = run.recording.with_suffix("").glob("look-*.json")
     assert set(json.loads(written.read_text())["objects"]) == {item.name for item in graph.objects}
+
+
+@pytest.mark.slow
+def test_a_look_without_depth_is_no_empty_table(tmp_path: Path) -> None:
+    (frame,) = RecordedFrames(ROOT / "recordings" / "reference.mcap")
+    bag = write_bag(tmp_path / "bag", looks(frame.rgb, 0 * frame.depth, frame.K, T_BASE_CAMERA, [START]))
+    run = run_graph(ROOT / "graphs" / "bag.yaml", f"camera.bag={bag}", folder=tmp_path)
+    assert run.code == 1, run.output
+    assert "nothing is known of 1 of them: 0.000 s: no support plane" in run.output
+    (written,) = run.recording.with_suffix("").glob("look-*.json")
+    assert "the depth image has 0 readings" in json.loads(written.read_text())["unusable"]

@@ -76,8 +76,10 @@ def write_scene_graph(path: Path, graph: SceneGraph) -> None:
 
 
 def scene_graph_content(graph: SceneGraph) -> dict[str, Any]:
-    """Assertions as text and poses as numbers; ``frame`` says what the poses are relative to."""
+    """Assertions as text and poses as numbers; ``frame`` says what the poses are relative to, and ``unusable``, where
+    it is there, why nothing was to be seen."""
     return {
+        **({"unusable": graph.unusable} if graph.unusable else {}),
         "scene_id": graph.scene_id,
         "im_id": graph.image_id,
         "frame": graph.frame,

@@ -25,11 +25,13 @@ class Lens:
         """``size`` is height and width of its images, pixels.
 
         Raises:
-            ValueError: there is no such model, or it has another number of coefficients.
+            ValueError: there is no such model, it has another number of coefficients, or one is not finite.
         """
         d = np.array(coefficients, np.float64).ravel()
         if model not in MODELS:
             raise ValueError(f"distortion model {model!r} is not known; valid: {', '.join(MODELS)}")
+        if not np.isfinite(d).all():
+            raise ValueError(f"distortion d = {d.tolist()}: its coefficients must be finite")
         self._maps = _maps(np.asarray(K, np.float64), size, d, model) if d.any() else None
 
     def straighten(self, rgb: Rgb, depth: Depth) -> tuple[Rgb, Depth]:

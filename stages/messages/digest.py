@@ -220,3 +220,5 @@ class SceneEstimate(Message, frozen=True, kw_only=True):
     """Hypotheses that end in the same scene as a heavier one: they have no share in ``probabilities``."""
     contested: tuple[str, ...] = ()
     """Labels of which more is there than in the scene by the detector, which takes it for likely, and a hypothesis."""
+    unusable: str = ""
+    """The observation's: why nothing was to be seen; then that there are no objects says nothing of the scene."""

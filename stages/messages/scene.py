@@ -154,6 +154,8 @@ class SceneGraph(Message, frozen=True, kw_only=True):
     """What stands there and is no object of the scene, as far as it was seen."""
     contested: tuple[str, ...] = ()
     """Labels, as :attr:`SceneEstimate.contested`."""
+    unusable: str = ""
+    """Why nothing was to be seen, as :attr:`Observation.unusable`: then no object here is no empty table."""
 
     @property
     def frame(self) -> Literal["base", "table"]:

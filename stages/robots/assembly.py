@@ -31,7 +31,7 @@ def specification(model: Model, *, seen: bool = True) -> mujoco.MjSpec:
         _couple(spec, *model.fingers, model.finger_servo)
     for kind, named in model.changed.items():
         for name, attributes in named.items():
-            _change(getattr(spec, kind)(name), attributes)
+            change(getattr(spec, kind)(name), attributes)
     for name in model.pads:
         _make_grippy(spec.geom(name))
     for first, second in model.touching:
@@ -107,7 +107,8 @@ def _text(part: Part) -> str:
     return ElementTree.tostring(root, encoding="unicode").replace(part.without, "")
 
 
-def _change(element: Any, attributes: Mapping[str, Any]) -> None:
+def change(element: Any, attributes: Mapping[str, Any]) -> None:
+    """Sets attributes of a body, joint or geom."""
     for key, value in attributes.items():
         now = getattr(element, key)
         if np.ndim(now):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
@@ -16,9 +16,11 @@ from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.robots.model import Model, Part, Servo
 from stages.robots.robot import Camera, Gripper, Robot, Table
-from stages.scene.catalogue.sections import Section, read_section
+from stages.scene.catalogue.sections import Section, is_number, read_section
 
 _KINDS = ("body", "joint", "geom")
+_WIDEST_HAND = 0.5
+"""Metres: what is more between two fingers is no metres."""
 
 
 @cache
@@ -62,12 +64,18 @@ def read_robot(path: Path) -> Robot:
     return robot
 
 
-def _whole(path: Path) -> Section:
-    """The file's outermost mapping; keys that it does not have are those of the file that it is ``like``."""
-    root = read_section(path)
+def _whole(path: Path, before: tuple[Path, ...] = ()) -> Section:
+    """The file's outermost mapping; keys that it does not have are those of the file that it is ``like``.
+
+    ``before`` are those that are like this one.
+    """
+    root, chain = read_section(path), (*before, path.resolve())
     if "like" not in root.values:
         return root
-    other = _whole(_located(root, "like"))
+    model = _located(root, "like")
+    if model.resolve() in chain:
+        root.refuse(f"{model} is like itself: {' is like '.join(each.name for each in (*chain, model))}", "like")
+    other = _whole(model, chain)
     del root.values["like"]
     return replace(root, values=other.values | root.values, lines=other.lines | root.lines)
 
@@ -83,13 +91,13 @@ def _model(root: Section) -> Model:
     joints = [*(root.section("joints").section(name) for name in root.section("joints").values), *_still(root)]
     return Model(
         parts=parts,
-        removed=tuple(root.items("remove")),
+        removed=tuple(root.texts("remove")),
         changed=_changes(root),
-        touching=tuple((first, second) for first, second in root.items("touching")),
+        touching=_touching(root),
         servos={joint.path.split(".")[-1]: servo for joint in joints if (servo := _servo(joint))},
         fingers=_fingers(gripper),
         finger_servo=_servo(gripper),
-        pads=tuple(gripper.items("pads")),
+        pads=tuple(gripper.texts("pads")),
     )
 
 
@@ -128,6 +136,14 @@ def _changes(root: Section) -> dict[str, dict[str, dict[str, Any]]]:
     changes.only(*_KINDS)
     kinds = {kind: changes.section(kind) for kind in changes.values}
     return {kind: {name: dict(named.section(name).values) for name in named.values} for kind, named in kinds.items()}
+
+
+def _touching(root: Section) -> tuple[tuple[str, str], ...]:
+    pairs = root.items("touching")
+    for pair in pairs:
+        if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
+            root.refuse(f"{pair!r} is not a pair of links, [one, other]", "touching")
+    return tuple((first, second) for first, second in pairs)
 
 
 def _view(view: Section, joints: Section) -> Floats:
@@ -169,12 +185,15 @@ def _gripper(section: Section) -> Gripper:
         "widest", "pads", "servo",
     )  # fmt: skip
     followers = section.section("followers") if "followers" in section.values else None
-    table = section.items("widths")
-    if len(table) < 2 or any(not isinstance(pair, list) or len(pair) != 2 for pair in table):
-        section.refuse(
-            "at least two pairs [position of a finger joint, metres between the fingers] are needed", "widths"
-        )
-    widths = np.array(sorted(table), float)
+    widths = _widths(section)
+    closed_width, open_width = section.number("closed_width", 0.0), section.number("open_width", low=0)
+    largest, widest = widths[:, 1].max(), section.number("widest", low=0)
+    if closed_width >= open_width:
+        section.refuse(f"{closed_width:g} m is not below open_width, {open_width:g} m", "closed_width")
+    if open_width > largest:
+        section.refuse(f"{open_width:g} m is more than the largest of widths, {largest:g} m", "open_width")
+    if widest > open_width:
+        section.refuse(f"{widest:g} m is more than open_width, {open_width:g} m", "widest")
     return Gripper(
         link=section.text("link"),
         T_link_hand=_mounting(section),
@@ -182,21 +201,45 @@ def _gripper(section: Section) -> Gripper:
         followers={name: followers.number(name) for name in followers.values} if followers else {},
         joint_positions=widths[:, 0],
         widths=widths[:, 1],
-        closed_width=section.number("closed_width", 0.0),
-        open_width=section.number("open_width", low=0),
-        widest=section.number("widest", low=0),
+        closed_width=closed_width,
+        open_width=open_width,
+        widest=widest,
     )
 
 
+def _widths(section: Section) -> Floats:
+    """N x 2: positions of a finger joint, rising, and metres between the fingers there."""
+    table = section.items("widths")
+    if len(table) < 2 or not all(
+        isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in table
+    ):
+        section.refuse(
+            f"{table!r}: at least two pairs [position of a finger joint, metres between the fingers] are needed",
+            "widths",
+        )
+    widths = np.array(sorted(table), float)
+    steps = np.diff(widths, axis=0)
+    if not ((steps[:, 0] > 0).all() and ((steps[:, 1] > 0).all() or (steps[:, 1] < 0).all())):
+        section.refuse(f"{widths.tolist()}: with the positions the widths must rise, or fall, at every step", "widths")
+    if not widths[:, 1].max() < _WIDEST_HAND:
+        section.refuse(
+            f"{widths[:, 1].max():g} m between the fingers; metres below {_WIDEST_HAND:g} are valid", "widths"
+        )
+    return widths
+
+
 def _fingers(gripper: Section) -> tuple[str, str]:
-    fingers = gripper.items("fingers")
+    fingers = gripper.texts("fingers")
     return (fingers[0], fingers[1]) if len(fingers) == 2 else gripper.refuse("two joints are needed", "fingers")
 
 
 def _camera(section: Section) -> Camera:
     section.only("link", "position", "rotation", "focal", "size", "calibrated")
     link, mounted = section.text("link", ""), {"position", "rotation"} & set(section.values)
-    width, height = section.numbers("size", 2).astype(int).tolist()
+    size = section.numbers("size", 2)
+    if (size < 1).any() or (size % 1).any():
+        section.refuse(f"{size.tolist()} is not [width, height], whole numbers of pixels from 1", "size")
+    width, height = size.astype(int).tolist()
     return Camera(
         link=link,
         T_link_camera=_mounting(section) if mounted or not link else None,
@@ -260,10 +303,26 @@ def _check(root: Section, robot: Robot) -> None:
         gripper.refuse("the model has no actuator for the fingers; give them a servo")
     for kind, valid in zip(_KINDS, (links, joints, geoms), strict=True):
         _known(root, robot.model.changed.get(kind, ()), valid, "change")
+        for name, attributes in robot.model.changed.get(kind, {}).items():
+            _check_changes(root.section("change").section(kind).section(name), getattr(spec, kind)(name), attributes)
     try:
         robot.specification(seen=False).compile()
     except ValueError as error:
         root.refuse(f"MuJoCo cannot build it: {error}", "model")
+
+
+def _check_changes(section: Section, element: Any, attributes: Mapping[str, Any]) -> None:
+    """Refuses what an element of MuJoCo's specification does not take."""
+    from stages.robots.assembly import change
+
+    for key, value in attributes.items():
+        if not hasattr(element, key):
+            valid = (name for name in dir(element) if name[0] != "_" and not callable(getattr(element, name)))
+            section.refuse(f"unknown attribute; valid are {', '.join(valid)}", key)
+        try:
+            change(element, {key: value})
+        except (AttributeError, TypeError, ValueError) as error:
+            section.refuse(f"{value!r} cannot be set: {str(error).splitlines()[0]}", key)
 
 
 def _joints_to(body: Any) -> list[str]:

@@ -8,7 +8,9 @@ from stages.scene.relations import TABLE
 
 
 def certainty(estimate: SceneEstimate) -> str:
-    """How sure a scene is, in one line; empty where it was not judged."""
+    """How sure a scene is, in one line; empty where it was not judged, why where nothing was to be seen."""
+    if estimate.unusable:
+        return f"nothing is known: {estimate.unusable}"
     judged = sorted((item.probability, item.name) for item in estimate.objects if item.probability is not None)
     if estimate.probabilities is None:
         return ""

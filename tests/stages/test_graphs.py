@@ -61,6 +61,13 @@ def test_recorded_boxes_are_those_of_the_pixels_that_the_camera_gives() -> None:
     assert load_graph(path, ("camera.stride=4", *_needed(path))).nodes["detector"].config.stride == 4
 
 
+@pytest.mark.parametrize("name", ["arm", "ros2"])
+@pytest.mark.parametrize(("frame", "found"), [("map", "map"), ("null", None)])
+def test_scenes_are_published_in_the_frame_in_which_the_camera_is(name: str, frame: str, found: str | None) -> None:
+    graph = load_graph(ROOT / f"graphs/{name}.yaml", (f"camera.topics.base_frame={frame}",))
+    assert (graph.nodes["camera"].config.topics.base_frame, graph.nodes["ros2"].config.frames.base) == (found, found)
+
+
 def test_a_setting_within_a_group_is_filled_in() -> None:
     arm, wrong = ROOT / "graphs/arm.yaml", "ros2.frames.base=${camera.topics.bas_frame}"
     assert load_graph(arm, ("camera.topics.base_frame=map",)).nodes["ros2"].config.frames.base == "map"

@@ -69,6 +69,21 @@ def test_a_node_asks_for_a_look_and_gets_its_scene(look: dict[str, Any]) -> None
     assert topics[f"{NAME}/scene_graph"].data.tobytes() == lab.types.encode(graphs[0].message)
 
 
+def test_who_asks_for_a_look_at_which_nothing_is_seen_is_told_why(look: dict[str, Any]) -> None:
+    blind = msgspec.structs.replace(look["scene_graph"], objects=(), assertions=(), virtual_objects=())
+    blind = msgspec.structs.replace(blind, unusable="no support plane")
+    with router() as endpoint, node(endpoint, "lab") as lab:
+        stage = Ros2Scenes(Ros2Scenes.Config(catalogue=BUILT_IN, link=Link(router=endpoint)))
+        future = call(lab, f"{NAME}/look")
+        (request,) = run_stage(stage, limit=1)
+        frame = msgspec.structs.replace(look["frame"], name=request.purpose)
+        (sent,) = run_stage(stage, [{**look, "frame": frame, "scene_graph": blind}], limit=1)
+        response = future.result(5.0)
+        stage.close()
+    assert (response.success, response.message) == (False, "nothing is known: no support plane")
+    assert [one.topic for one in sent.messages] == [f"{NAME}/scene_graph", f"{NAME}/look"]
+
+
 def test_looks_may_be_taken_unasked(look: dict[str, Any]) -> None:
     with router() as endpoint:
         stage = Ros2Scenes(Ros2Scenes.Config(catalogue=BUILT_IN, link=Link(router=endpoint), every=0.0))

@@ -58,23 +58,30 @@ class LiveCamera:
         """The next image, taken and received from now on, of a camera that stands still; ``say`` takes warnings.
 
         Raises:
-            Refused: it cannot be read, or there was none for so long; names topic or frame and what is wrong.
+            Refused: for so long there was none that can be read; names topic or frame and what is wrong.
         """
         with self._changed:
             self._looks.clear()
             self._asked_ns = time.time_ns()
         give_up = time.monotonic() + self._patience.give_up
-        while (pair := self._wait()) is None:
+        told, again = "", 0.0
+        while True:
+            pair = self._wait()
             self._report(say)
-            if why := self._why_none():  # else it has just come
-                if time.monotonic() > give_up:
-                    raise Refused(why)
+            if pair is None:
+                why = self._why_none()
+            else:
+                try:
+                    return frame_of(self._source, pair, self._info, self._transforms, name=name, index=index, total=0)
+                except Unusable as error:
+                    why = str(error)
+                    self._drop(pair)
+            now = time.monotonic()
+            if why and now > give_up:
+                raise Refused(why)
+            if why and (why != told or now >= again):  # else it has just come, or is as bad as the one before
                 say(f"no look yet: {why}")
-        self._report(say)
-        try:
-            return frame_of(self._source, pair, self._info, self._transforms, name=name, index=index, total=0)
-        except Unusable as error:
-            raise Refused(str(error)) from None
+                told, again = why, now + self._patience.warn
 
     def close(self) -> None:
         """Leaves the ROS graph."""
@@ -112,6 +119,12 @@ class LiveCamera:
 
     def _usable(self) -> Pair | None:
         return next((pair for pair in self._looks if not self._trouble(pair)), None)
+
+    def _drop(self, pair: Pair) -> None:
+        """Leaves out a look that cannot be read, and those before it: the next one may be whole."""
+        with self._changed:
+            while self._looks and self._looks[0].stamp_ns <= pair.stamp_ns:
+                self._looks.popleft()
 
     def _trouble(self, pair: Pair) -> str:
         """Why a look is not used, or not yet; empty where it is."""

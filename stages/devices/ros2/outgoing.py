@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from runner.contract import Refused
 from stages.devices.bop_results import scene_graph_content
 from stages.devices.ros2.images import IMAGE
 from stages.devices.ros2.rgbd import INFO, TF
@@ -67,26 +68,39 @@ class Scenes:
             ),
         )
         if frame.T_base_camera is not None:
-            placed = _placed(self._frames.base, self._frames.camera, frame.T_base_camera, stamp_ns)
+            placed = _placed(self._base(), self._frames.camera, frame.T_base_camera, stamp_ns)
             yield Outgoing("/tf", self._types.new(TF, transforms=[placed]))
 
     def scene(self, estimate: SceneEstimate, graph: SceneGraph, stamp_ns: int) -> Iterator[Outgoing]:
-        """A scene graph and the estimate that it is of."""
-        where = self._frames.base if graph.frame == "base" else TABLE
-        header = _header(stamp_ns, where)
+        """A scene graph and the estimate that it is of; of a look at which nothing was to be seen only the JSON, which
+        says why: what was published before still is what is known."""
+        where = self._base() if graph.frame == "base" else TABLE
         estimates = {item.name: item for item in estimate.objects}
-        T_where_camera = graph.T_base_table @ inverse(estimate.T_camera_table)
-        detections = [self._detection(estimates[item.name], T_where_camera, header) for item in graph.objects]
-        yield Outgoing("~/detections", self._types.new(DETECTIONS, header=header, detections=detections))
-        placed = [_placed(where, f"scene/{item.name}", item.T_base_object, stamp_ns) for item in graph.objects]
-        if graph.frame == "table":
-            placed.append(_placed(self._frames.camera, TABLE, estimate.T_camera_table, stamp_ns))
-        yield Outgoing("/tf", self._types.new(TF, transforms=placed))
-        yield Outgoing("~/markers", self._markers(estimates, graph, header))
+        if not graph.unusable:
+            yield from self._seen(estimates, estimate.T_camera_table, graph, where, stamp_ns)
         content = {"stamp_ns": stamp_ns, "frame_id": where, **scene_graph_content(graph)}
         content["labels"] = {item.name: item.label for item in graph.objects}
         content["probabilities"] = {item.name: estimates[item.name].probability for item in graph.objects}
         yield Outgoing("~/scene_graph", self._types.new(STRING, data=json.dumps(content)))
+
+    def _seen(
+        self, estimates: Mapping[str, ObjectPose], T_camera_table: Pose, graph: SceneGraph, where: str, stamp_ns: int
+    ) -> Iterator[Outgoing]:
+        """The objects in the frame ``where``."""
+        header = _header(stamp_ns, where)
+        T_where_camera = graph.T_base_table @ inverse(T_camera_table)
+        detections = [self._detection(estimates[item.name], T_where_camera, header) for item in graph.objects]
+        yield Outgoing("~/detections", self._types.new(DETECTIONS, header=header, detections=detections))
+        placed = [_placed(where, f"scene/{item.name}", item.T_base_object, stamp_ns) for item in graph.objects]
+        if where == TABLE:
+            placed.append(_placed(self._frames.camera, TABLE, T_camera_table, stamp_ns))
+        yield Outgoing("/tf", self._types.new(TF, transforms=placed))
+        yield Outgoing("~/markers", self._markers(estimates, graph, header))
+
+    def _base(self) -> str:
+        if self._frames.base is None:
+            raise Refused("frames.base is null, but it is known how the camera stands to the robot: name that frame")
+        return self._frames.base
 
     def _image(self, pixels: Any, encoding: str, header: dict[str, Any]) -> Any:
         height, width = pixels.shape[:2]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from runner.contract import Message
 from runner.view.ros2_bag import BagMessage
@@ -20,10 +21,11 @@ _Look = tuple[int, int, str]
 class RecordedScenes:
     """Remembers looks and estimates until their scene graph comes."""
 
-    def __init__(self, catalogue: Catalogue) -> None:
+    def __init__(self, catalogue: Catalogue, configs: Mapping[str, Mapping[str, Any]]) -> None:
+        """``configs``: the settings of the graph's stages, which may name frames."""
         self._link = Link()
         self._types = Types.of(self._link.distribution)
-        self._scenes = Scenes(self._types, catalogue, Frames())
+        self._scenes = Scenes(self._types, catalogue, _frames(configs))
         self._stamps: dict[_Look, int] = {}
         self._estimates: dict[_Look, SceneEstimate] = {}
 
@@ -45,6 +47,16 @@ class RecordedScenes:
         topic = full_name(outgoing.topic, self._link.namespace, self._link.node, {})
         types = self._types
         return BagMessage(topic, name, types.definition(name), types.hash(name), types.encode(outgoing.message))
+
+
+def _frames(configs: Mapping[str, Mapping[str, Any]]) -> Frames:
+    """Those under which a graph publishes; where it does not, the base among its camera's transforms."""
+    groups = [group for config in configs.values() for group in config.values() if isinstance(group, Mapping)]
+    for group in groups:
+        if set(group) == {"base", "camera"}:
+            return Frames(**group)
+    bases = [group["base_frame"] for group in groups if "base_frame" in group]
+    return Frames(base=bases[0]) if bases else Frames()
 
 
 def _look(message: Frame | SceneEstimate | SceneGraph) -> _Look:

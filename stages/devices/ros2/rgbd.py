@@ -74,7 +74,7 @@ def frame_of(
             "colour"
         )
     own, wanted = pair.depth.header.frame_id, pair.color.header.frame_id
-    if own != wanted and not source.registered:
+    if own.lstrip("/") != wanted.lstrip("/") and not source.registered:
         raise Unusable(
             f"{source.depth}: is of frame {own!r}, but {source.color} of {wanted!r}; depth must be registered to "
             "colour: choose the aligned topic (align_depth.enable:=true), or set topics.registered=true where it is"

@@ -12,6 +12,8 @@ from runner.contract import Refused
 Distribution = Literal["jazzy", "kilted", "lyrical"]
 DISTRIBUTIONS: tuple[Distribution, ...] = get_args(Distribution)
 LAST_DOMAIN = 232
+LONGEST = 1e9
+"""Seconds: as good as for ever."""
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -60,6 +62,10 @@ class Source:
     """The robot's base among the transforms. None where nobody knows how the camera stands to it: poses are in the
     table's frame, and nothing is planned in them."""
 
+    def __post_init__(self) -> None:
+        """Refuses a slop that is no time."""
+        _refuse_odd_numbers("topics", self, "slop", zero=True)
+
     @property
     def images(self) -> tuple[str, str]:
         """The topics of colour and depth."""
@@ -77,6 +83,11 @@ class Patience:
     """Between an image's stamp and its arrival by this machine's clock: more is an image of another time."""
     settle: float = 0.2
     """For so long the camera must have stood where it stands in the image."""
+
+    def __post_init__(self) -> None:
+        """Refuses what is no time."""
+        _refuse_odd_numbers("patience", self, "warn", "max_age")
+        _refuse_odd_numbers("patience", self, "give_up", "settle", zero=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,19 +137,27 @@ class Care:
         """Refuses what would not move, or at once be given up."""
         if not 0 < self.speed <= 1:
             raise Refused(f"care.speed = {self.speed:g}: must be above 0 and at most 1")
-        for name in ("path_tolerance", "goal_tolerance", "goal_time", "stale", "max_age", "stuck", "answer"):
-            if not getattr(self, name) > 0:
-                raise Refused(f"care.{name} = {getattr(self, name):g}: must be above 0")
+        _refuse_odd_numbers(
+            "care", self, "path_tolerance", "goal_tolerance", "goal_time", "stale", "max_age", "stuck", "answer"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frames:
     """Names of frames among the lab's transforms."""
 
-    base: str = "base_link"
-    """What poses are given in, where it is known how the camera stands to the robot."""
+    base: str | None = "base_link"
+    """What poses are given in, where it is known how the camera stands to the robot; None where it never is."""
     camera: str = "camera_color_optical_frame"
     """Of the colour camera; else poses are in the table's frame, which hangs on this one."""
+
+
+def _refuse_odd_numbers(part: str, settings: object, *names: str, zero: bool = False) -> None:
+    """Raises Refused where one of a part's settings is no number above 0, or 0 where that is valid."""
+    for name in names:
+        value = getattr(settings, name)
+        if not 0 <= value < LONGEST or (value == 0 and not zero):
+            raise Refused(f"{part}.{name} = {value:g}: must be {'0 or more' if zero else 'above 0'}, below {LONGEST:g}")
 
 
 def refuse_odd_name(place: str, name: str) -> None:

@@ -36,11 +36,17 @@ class Transforms:
         """``keep_seconds`` is how long a moving frame's past is kept; None for ever."""
         self._keep_ns = None if keep_seconds is None else int(keep_seconds * 1e9)
         self._edges: dict[str, _Edge] = {}
+        self._left_out: dict[str, str] = {}
+        """By frame: what was said of it last and is no transform."""
 
     def add(self, message: Any, *, static: bool) -> None:
-        """Takes a tf2_msgs/msg/TFMessage."""
+        """Takes a tf2_msgs/msg/TFMessage, without what is no transform in it; :meth:`lookup` says so where it lacks."""
         for one in message.transforms:
             child, parent = one.child_frame_id.lstrip("/"), one.header.frame_id.lstrip("/")
+            if problem := _problem(one.transform):
+                self._left_out[child] = f"{parent} to {child} has {problem}, which is no transform"
+                continue
+            self._left_out.pop(child, None)
             edge = self._edges.get(child)
             if edge is None or edge.parent != parent or edge.static != static:
                 edge = self._edges[child] = _Edge(parent, static)
@@ -89,7 +95,8 @@ class Transforms:
         first, last = edge.stamps[0], edge.stamps[-1]
         if not first <= at_ns <= last:
             known = f"it is from {seconds(first)} to {seconds(last)}"
-            raise NoTransform(f"{edge.parent} to {frame} is not known at {seconds(at_ns)}: {known}")
+            since = f"; since then {self._left_out[frame]}" if frame in self._left_out else ""
+            raise NoTransform(f"{edge.parent} to {frame} is not known at {seconds(at_ns)}: {known}{since}")
         after = bisect_left(edge.stamps, at_ns)
         if edge.stamps[after] == at_ns:
             return edge.poses[after]
@@ -100,6 +107,9 @@ class Transforms:
         return T
 
     def _unconnected(self, to: str, source: str, up: list[str], down: list[str]) -> str:
+        for root in (up[-1], down[-1]):
+            if root in self._left_out:
+                return self._left_out[root]
         known = sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
         for frame in (to, source):
             if frame.lstrip("/") not in known:
@@ -115,6 +125,17 @@ def stamp_ns(header: Any) -> int:
 def seconds(time_ns: int) -> str:
     """A time for people."""
     return f"{time_ns / 1e9:.3f} s"
+
+
+def _problem(transform: Any) -> str:
+    """Why it is no transform; empty where it is one."""
+    turn, place = transform.rotation, transform.translation
+    x, y, z, w = turn.x, turn.y, turn.z, turn.w
+    if not np.isfinite([x, y, z, w]).all() or not np.linalg.norm([x, y, z, w]) > 0:
+        return f"the rotation x y z w = {x:g} {y:g} {z:g} {w:g}"
+    if not np.isfinite([place.x, place.y, place.z]).all():
+        return f"the translation x y z = {place.x:g} {place.y:g} {place.z:g}"
+    return ""
 
 
 def _matrix(transform: Any) -> Pose:

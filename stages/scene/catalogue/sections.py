@@ -95,6 +95,11 @@ class Section:
         value = self.value(key, [])
         return value if isinstance(value, list) else self._mismatch(key, "a list")
 
+    def texts(self, key: str) -> list[str]:
+        """A list of strings; empty where the key is missing."""
+        values = self.items(key)
+        return values if all(isinstance(value, str) for value in values) else self._mismatch(key, "a list of texts")
+
     def sections(self, key: str) -> Iterator[Section]:
         """A list of mappings; empty where the key is missing."""
         for item in self.items(key):
@@ -139,7 +144,12 @@ def _convert(node: yaml.Node, file: Path, path: str) -> Any:
         return _mapping(node, file, path)
     if isinstance(node, yaml.SequenceNode):
         return [_convert(item, file, f"{path}[{index}]") for index, item in enumerate(node.value)]
-    return yaml.SafeLoader("").construct_object(node)
+    try:
+        return yaml.SafeLoader("").construct_object(node)
+    except (ValueError, yaml.YAMLError) as error:
+        why = getattr(error, "problem", None) or error
+        place = f"{file}:{node.start_mark.line + 1}: {path}"
+        raise Refused(f"{place}: '{node.value}' is no value, {why}; in quotes it is a text") from error
 
 
 def _mapping(node: yaml.MappingNode, file: Path, path: str) -> Section:

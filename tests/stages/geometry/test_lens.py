@@ -35,8 +35,10 @@ def test_a_lens_is_taken_out(model: str, d: list[float]) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_what_does_not_bend_is_left_alone_and_a_wrong_number_of_coefficients_is_refused(model: str) -> None:
+def test_what_does_not_bend_is_left_alone_and_wrong_coefficients_are_refused(model: str) -> None:
     rgb, metres = np.zeros((80, 100, 3), np.uint8), np.ones((80, 100), np.float32)
     assert Lens(K, (80, 100), [0.0] * 4, model).straighten(rgb, metres) == (rgb, metres)
     with pytest.raises(ValueError, match=f"'{model}' does not have 3 coefficients"):
         Lens(K, (80, 100), [0.1, 0.2, 0.3], model)
+    with pytest.raises(ValueError, match=r"distortion d = \[nan, 0.0, 0.0, 0.0\]: its coefficients must be finite"):
+        Lens(K, (80, 100), [np.nan, 0.0, 0.0, 0.0], model)

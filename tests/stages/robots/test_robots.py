@@ -117,6 +117,19 @@ def test_the_torso_carries_the_camera() -> None:
             r"views\[0\]\.torso_joint: unknown key; valid are torso_lift",
         ),
         ("touching:", "touch:", r"touch: unknown key; valid are model, remove"),
+        ("  - [base_link, torso_fixed_link]", "  - base_link", r":23: touching: 'base_link' is not a pair of links"),
+        ("{range: [0.0, 0.38615]}", "{rnage: [0, 1]}", r":20: change.*\.rnage: unknown attribute; valid are .* range,"),
+        ("{range: [0.0, 0.38615]}", "{range: wide}", r":20: change.*\.range: 'wide' cannot be set"),
+        ("remove: [", "remove: [1, ", r":\d+: remove: \[1, .* is not a list of texts"),
+        ("[r_gripper_finger_joint, l", "[1, l", r":62: gripper\.fingers: \[1, .* is not a list of texts"),
+        ("0.1018]]", "wide]]", r":63: gripper\.widths: .*at least two pairs \[position of a finger joint, metres"),
+        ("0.1018]]", "101.8]]", r":63: gripper\.widths: 101\.8 m between the fingers; metres below 0\.5 are valid"),
+        ("0.1018]]", "0.0018]]", r":63: gripper\.widths: .*the widths must rise, or fall, at every step"),
+        ("[0.05, 0.1018]]", "[0.0, 0.1018]]", r":63: gripper\.widths: .*must rise, or fall, at every step"),
+        ("closed_width: 0.0018", "closed_width: 0.2", r":64: gripper\.closed_width: 0\.2 m is not below open_width"),
+        ("open_width: 0.1018", "open_width: 0.2", r":65: gripper\.open_width: 0\.2 m is more than the largest of w"),
+        ("widest: 0.095", "widest: 0.11", r":66: gripper\.widest: 0\.11 m is more than open_width, 0\.1018 m"),
+        ("size: [640, 480]", "size: [0, 0]", r":70: camera\.size: \[0\.0, 0\.0\] is not \[width, height\], whole"),
     ],
 )
 def test_what_is_wrong_is_named(old: str, new: str, message: str, tmp_path: Path) -> None:
@@ -141,6 +154,14 @@ def test_a_description_may_be_like_another(tmp_path: Path) -> None:
     robot, other = read_robot(file), read_robot(FOLDER / "ur5e.yaml")
     assert (robot.floor, other.floor) == (-0.9, -0.7)
     assert robot.posture == other.posture
+
+
+def test_descriptions_that_are_like_each_other_are_refused(tmp_path: Path) -> None:
+    file, other = tmp_path / "robot.yaml", tmp_path / "other.yaml"
+    file.write_text("like: other.yaml\n")
+    other.write_text("floor: 0\nlike: robot.yaml\n")
+    with pytest.raises(Refused, match=r"other\.yaml:2: like: .*: robot\.yaml is like other\.yaml is like robot\.yaml"):
+        read_robot(file)
 
 
 def test_a_description_is_tried_before_it_is_used() -> None:

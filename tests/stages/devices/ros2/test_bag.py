@@ -113,10 +113,14 @@ def test_depth_pairs_with_the_nearest_colour(tmp_path: Path) -> None:
 def wrong(name: str, messages: list[Stamped]) -> list[Stamped]:
     """A bag with one thing wrong."""
     millimetres = np.round(DEPTH * 1000).astype(np.uint16)
+    unturned = transform("base_link", CAMERA, np.eye(4))
+    unturned.transforms[0].transform.rotation.w = 0.0
     return {
         "no colour": without(messages, SOURCE.color),
         "no info": without(messages, SOURCE.info),
         "no transform": without(messages, "/tf_static"),
+        "a quaternion of zeros": replaced(messages, {"/tf_static": unturned}),
+        "a lens of nan": replaced(messages, {SOURCE.info: info(K, (24, 32), d=np.full(5, np.nan))}),
         "another frame": replaced(messages, {"/tf_static": transform("base_link", "hand", np.eye(4))}),
         "colour as depth": replaced(messages, {SOURCE.depth: image(RGB, "rgb8")}),
         "depth as colour": replaced(messages, {SOURCE.color: image(millimetres, "16UC1")}),
@@ -134,6 +138,11 @@ def wrong(name: str, messages: list[Stamped]) -> list[Stamped]:
         ("no info", rf"has no topic {SOURCE.info}; there are in all: {SOURCE.depth}, {SOURCE.color}, /tf_static"),
         ("no transform", rf"camera frame '{CAMERA}' of {SOURCE.color}: no transform names frame 'base_link'"),
         ("another frame", rf"no transform names frame '{CAMERA}'; there are: base_link, hand"),
+        (
+            "a quaternion of zeros",
+            rf"frame '{CAMERA}' of {SOURCE.color}: base_link to {CAMERA} has the rotation .* 0 0 0 0",
+        ),
+        ("a lens of nan", rf"{SOURCE.info}: distortion d = \[nan, .*: its coefficients must be finite"),
         ("colour as depth", rf"{SOURCE.depth}: encoding 'rgb8' is no depth that is read; valid: 16UC1, mono16, 32FC1"),
         ("depth as colour", rf"{SOURCE.color}: encoding '16UC1' is no colour that is read; valid: rgb8, bgr8"),
         (
@@ -161,6 +170,14 @@ def test_depth_of_another_frame_is_taken_where_somebody_says_that_it_is_register
     path = write_bag(tmp_path / "bag", wrong("own frame", looks(RGB, DEPTH, K, T_base_camera(), STAMPS[:1])))
     (found,) = frames(path, topics=Source(registered=True))
     assert np.array_equal(found.depth, DEPTH) and found.T_base_camera == pytest.approx(T_base_camera())
+
+
+def test_frames_are_equal_whether_a_slash_begins_them_or_not(tmp_path: Path) -> None:
+    millimetres = np.round(DEPTH * 1000).astype(np.uint16)
+    slashed = {SOURCE.depth: image(millimetres, "16UC1", frame=f"/{CAMERA}")}
+    path = write_bag(tmp_path / "bag", replaced(looks(RGB, DEPTH, K, T_base_camera(), STAMPS[:1]), slashed))
+    (found,) = frames(path)
+    assert np.array_equal(found.depth, DEPTH)
 
 
 def test_what_is_no_bag_is_named(tmp_path: Path) -> None:

@@ -59,17 +59,49 @@ def test_rvl_of_a_large_image() -> None:
     assert np.array_equal(np.round(read * 1000).astype(np.uint16), surface)
 
 
+FORMAT = "16UC1; compressedDepth png"
+
+
+def words(*packed: int) -> Any:
+    """RVL of these words: columns, rows, nibbles."""
+    return compressed(bytes(12) + np.array(packed, "<u4").tobytes(), "16UC1; compressedDepth rvl")
+
+
 @pytest.mark.parametrize(
     ("read", "message", "says"),
     [
         (color, image(MILLIMETRES, "mono16"), "encoding 'mono16' is no colour that is read; valid: rgb8, bgr8"),
         (depth, image(RGB, "rgb8"), "encoding 'rgb8' is no depth that is read; valid: 16UC1"),
+        (color, image(RGB[:, :0], "rgb8"), "an image of 0 x 4 pixels"),
         (color, compressed(b"nothing", "jpeg"), "7 bytes of format 'jpeg' are no image"),
         (depth, compressed(b"", "jpeg"), "format 'jpeg' is no depth that is read"),
         (depth, compressed(bytes(12), "16UC1; compressedDepth png"), "0 bytes of format"),
         (depth, compressed(bytes(12) + b"\2\0\0\0\2\0\0\0\0\0\0\0", "16UC1; compressedDepth rvl"), "ends after"),
         (depth, compressed(bytes(20), "16UC1; compressedDepth rvl"), "RVL of 8 bytes has no pixels"),
         (depth, compressed(b"", "16UC1; compressedDepth png"), "compressed depth of 0 bytes has no header"),
+        (
+            color,
+            compressed(png(RGB[:, :, 0]), "mono8; png compressed "),
+            "'mono8; png compressed ' holds 1 channel of 8 b",
+        ),
+        (
+            color,
+            compressed(png(MILLIMETRES), "rgb8; png compressed bgr8"),
+            "holds 1 channel of 16 bits; colour has 3 or",
+        ),
+        (depth, compressed(bytes(12) + png(RGB), FORMAT), "holds 3 channels of 8 bits; depth has 1 channel of 16 bits"),
+        (
+            depth,
+            compressed(bytes(12) + png(RGB[:, :, 0]), FORMAT),
+            "'16UC1; compressedDepth png' holds 1 channel of 8 b",
+        ),
+        (depth, image(1000 * METRES, "32FC1"), "median depth is 500.5 m; metres are expected.*; 16UC1 is millimetres"),
+        (depth, image(METRES / 1000, "32FC1"), "median depth is 0.0005005 m"),
+        (depth, words(4_000_000, 4_000_000, 0x01234567), "RVL of 4000000 x 4000000 pixels; at most 16777216 are read"),
+        (depth, words(2, 2, 0xFFFFFFFF), "RVL of 2 x 2 pixels has a number without end"),
+        (depth, words(2, 2, 0xFFFFFFFF, 0xFFF00000), "RVL of 2 x 2 pixels has a number without end"),
+        (depth, words(2, 2, 0x05222220), "RVL of 2 x 2 pixels has 5"),
+        (depth, words(2, 2, 0x07222220), "RVL of 2 x 2 pixels ends after 0"),
     ],
 )
 def test_what_cannot_be_read_is_named(read: Any, message: Any, says: str) -> None:
@@ -97,6 +129,11 @@ def test_what_a_camera_info_says() -> None:
         lens(info(K, (80, 100), d=[0.1], distortion_model="thin"), K, rectified=False)
     with pytest.raises(ValueError, match="the camera is not calibrated"):
         pinhole(TYPES.new("sensor_msgs/msg/CameraInfo"), rectified=False)
+    for name in ("binning_x", "binning_y", "roi.x_offset", "roi.y_offset"):
+        part = info(K, (80, 100), d=[])
+        setattr(part.roi if "roi" in name else part, name.removeprefix("roi."), 2)
+        with pytest.raises(ValueError, match=f"^{name} = 2: images that are binned or cut out are not read; valid: "):
+            pinhole(part, rectified=False)
     with pytest.raises(ValueError, match=r"K = .*without skew"):
         pinhole(info(K + np.diag([2.0, 0], 1), (80, 100), d=[]), rectified=False)
 

@@ -112,6 +112,20 @@ def test_compressed_topics() -> None:
     assert np.array_equal(frame.rgb, RGB) and np.array_equal(np.round(frame.depth * 1000), MILLIMETRES)
 
 
+def test_a_packet_that_is_broken_costs_one_look_and_the_next_is_taken() -> None:
+    said: list[str] = []
+    with router() as endpoint, driver(endpoint, COMPRESSED) as one:
+        whole = bytes(12) + png(MILLIMETRES)
+        one.color = lambda stamp: compressed(png(RGB[:, :, ::-1]), "rgb8; png compressed bgr8", stamp)
+        one.depth = lambda stamp: compressed(whole if said else whole[:40], "16UC1; compressedDepth png", stamp)
+        config = Ros2Camera.Config(link=Link(router=endpoint), topics=COMPRESSED, patience=LONG)
+        camera = Ros2Camera(config)
+        (frame,) = run_stage(camera, [LookRequest(purpose="goal")], log=lambda text, level: said.append(text))
+        camera.close()
+    assert np.array_equal(np.round(frame.depth * 1000), MILLIMETRES)
+    assert f"no look yet: {COMPRESSED.depth}: 28 bytes of format '16UC1; compressedDepth png' are no image" in said
+
+
 def test_a_camera_that_moves_is_waited_for() -> None:
     with router() as endpoint, driver(endpoint) as camera:
         stops = time.monotonic() + 1.5

@@ -13,11 +13,13 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from runner.cli.main import main
+from runner.contract import Refused
 from runner.message.codec import open_envelope
 from runner.recording.recording import Recording
 from runner.testing import run_stage
 from stages.camera import BagCamera
 from stages.devices.ros2.outgoing import Outgoing, Scenes
+from stages.devices.ros2.recorded import RecordedScenes
 from stages.devices.ros2.settings import Frames, Source
 from stages.messages import Frame, ObjectPose, SceneEstimate, SceneGraph
 from stages.messages.scene import Alternative
@@ -117,6 +119,31 @@ def test_transforms_hang_on_the_base_or_on_the_camera(reference: Any) -> None:
     assert {one.header.frame_id for one in placed.values()} == {"scene/table"}
 
 
+def test_a_recordings_frames_are_those_of_its_graph(reference: Any) -> None:
+    _, estimate, graph = reference
+    published = {"ros2": {"frames": {"base": "base", "camera": "eye"}}}
+    heard = {"camera": {"topics": {"base_frame": "map"}}}
+    for configs, base, camera in (
+        (heard | published, "base", "eye"),
+        (heard, "map", "camera_color_optical_frame"),
+        ({"camera": {}}, "base_link", "camera_color_optical_frame"),
+    ):
+        for scene, frame in ((in_base(estimate, graph), base), ((estimate, graph), camera)):
+            recorded = RecordedScenes(Catalogue.shared(BUILT_IN), configs)
+            frame_message = msgspec.structs.replace(reference[0], T_base_camera=scene[0].T_base_camera)
+            told = [one for message in (frame_message, *scene) for one in recorded.told(message, START)]
+            placed = [TYPES.decode(one.data, one.type).transforms for one in told if one.topic == "/tf"]
+            assert frame in {one.header.frame_id for transforms in placed for one in transforms}
+
+
+def test_poses_in_a_base_without_a_name_are_refused(reference: Any) -> None:
+    _, estimate, graph = reference
+    scenes = Scenes(TYPES, Catalogue.shared(BUILT_IN), Frames(base=None))
+    assert list(scenes.scene(estimate, graph, START))
+    with pytest.raises(Refused, match=r"frames\.base is null, but it is known how the camera stands to the robot"):
+        list(scenes.scene(*in_base(estimate, graph), START))
+
+
 def test_markers_are_meshes_with_names_and_replace_the_last_scene(reference: Any) -> None:
     _, estimate, graph = reference
     first, *markers = told(estimate, graph)["~/markers"].markers
@@ -133,6 +160,14 @@ def test_the_scene_graph_is_json(reference: Any) -> None:
     assert content["assertions"] == [str(one) for one in graph.assertions]
     assert content["labels"] == {item.name: item.label for item in graph.objects}
     assert (content["frame_id"], content["stamp_ns"]) == ("scene/table", START)
+
+
+def test_of_a_look_at_nothing_only_the_reason_is_told(reference: Any) -> None:
+    _, estimate, graph = reference
+    blind = msgspec.structs.replace(graph, objects=(), assertions=(), virtual_objects=(), unusable="no support plane")
+    (topic, said), *others = told(msgspec.structs.replace(estimate, objects=()), blind).items()
+    assert (topic, others) == ("~/scene_graph", [])
+    assert json.loads(said.data)["unusable"] == "no support plane"
 
 
 def test_a_recording_becomes_a_bag_that_others_read_and_that_is_a_camera_again(

@@ -52,6 +52,25 @@ def test_what_is_not_known_is_named(tree: Transforms) -> None:
         tree.lookup("base", "robot", SECOND)
 
 
+def test_what_is_no_transform_is_left_out_and_named_where_it_lacks(tree: Transforms) -> None:
+    """Drivers that were not calibrated publish quaternions of zeros; the rest of their messages holds."""
+    nowhere, unturned = transform("base", "arm", pose(np.nan), 5 * SECOND), transform("base", "lidar", pose(0.0))
+    unturned.transforms[0].transform.rotation.w = 0.0
+    unturned.transforms += transform("base", "radar", pose(3.0)).transforms
+    tree.add(unturned, static=True)
+    tree.add(nowhere, static=False)
+    assert tree.lookup("base", "camera", 2 * SECOND)[0, 3] == pytest.approx(2 + 0.1 * np.cos(0.4))
+    assert tree.lookup("base", "radar", 0)[0, 3] == 3
+    with pytest.raises(NoTransform, match=r"^base to lidar has the rotation x y z w = 0 0 0 0, which is no transform"):
+        tree.lookup("base", "lidar", SECOND)
+    with pytest.raises(
+        NoTransform, match=r"from 1.000 s to 4.000 s; since then base to arm has the translation x y z = nan"
+    ):
+        tree.lookup("base", "camera", 5 * SECOND)
+    tree.add(transform("base", "lidar", pose(7.0)), static=True)
+    assert tree.lookup("base", "lidar", SECOND)[0, 3] == 7
+
+
 def test_only_the_newest_past_is_kept() -> None:
     transforms = Transforms(keep_seconds=2.0)
     for time in range(10):

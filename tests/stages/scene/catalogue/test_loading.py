@@ -109,6 +109,11 @@ MISTAKES = [
     (mesh() + "    grasps: top\n", r":4: objects.jar.grasps: 'top' is not a list"),
     (mesh() + "  pot:\n" + mesh() + "    label: 1\n", r":6: objects.pot.label: 1 is the label of 'jar' already"),
     ("    mesh: [\n", r":\d+: not valid YAML"),
+    (
+        mesh() + "    mass: 2024-13-45\n",
+        r":4: objects.jar.mass: '2024-13-45' is no value, month must be in 1..12.*; in quotes it is a text",
+    ),
+    (mesh() + "    mass: !kg 1\n", r":4: objects.jar.mass: '1' is no value, .*'!kg'; in quotes"),
 ]
 
 
