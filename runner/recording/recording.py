@@ -158,13 +158,7 @@ class Recording:
         """Topic, log time, record and checksum of all entries in the order of the file."""
         self._misplaced: dict[str, None] = {}
         """Findings: metadata that does not stand where it was written."""
-        with open_file(path) as file:
-            growing = is_being_written(file)
-            self._read(Container(file, str(path)))
-            if self.container.unknown:
-                file.seek(0)
-                self._forget()
-                self._read(Container(file, str(path), self.container))
+        growing = self._read_file(path)
         self.damage, self.torn = self.container.damage, self.container.torn
         """Places that do not hold what was written there, as ``byte 4711: reason``; whether the end is missing."""
         self._growing = growing and self.torn
@@ -236,6 +230,17 @@ class Recording:
     def envelopes(self) -> Iterator[Envelope]:
         """Every message in the order of recording."""
         return (self.envelope(id) for id in self.messages)
+
+    def _read_file(self, path: Path) -> bool:
+        """Returns whether somebody was writing it when that began."""
+        with open_file(path) as file:
+            growing = is_being_written(file)
+            self._read(Container(file, str(path)))
+            if self.container.unknown:
+                file.seek(0)
+                self._forget()
+                self._read(Container(file, str(path), self.container))
+        return growing
 
     def _forget(self) -> None:
         lists = self.steps, self.ends, self.log, self.lost, self._order
