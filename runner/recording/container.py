@@ -188,7 +188,8 @@ def _records(stream: IO[bytes] | Growing, *, whole: bool = True) -> Iterator[Mca
         elif opcode == Opcode.FOOTER:
             yield _compared("summary", content, zlib.crc32(content[:-4], zlib.crc32(head, checksum)))
         else:
-            checksum = zlib.crc32(content, zlib.crc32(head, checksum))
+            if whole or opcode != Opcode.CHUNK:  # No summary holds a chunk, which has a checksum of its own.
+                checksum = zlib.crc32(content, zlib.crc32(head, checksum))
             yield _record(opcode, content)
     _magic(stream)
 
