@@ -327,7 +327,8 @@ class Demonstrator(Stage):
             yield question
             return
         scene_graph = self._memory.named(scene_graph, state.known, observation, state.seen)
-        scene = self._memory.complete(scene_graph, state.known, observation)
+        goal = state.whole or state.goal
+        scene = self._memory.complete(scene_graph, state.known, observation, _names(goal) if goal else ())
         seen, ahead, unproved = state.seen | _names(scene_graph), state.views[1:], state.unproved
         if state.goal is not None and (not state.known or _spares(scene, state.goal)):
             names = self._exchanged(scene, state.goal)

@@ -155,6 +155,33 @@ def test_a_stranger_of_which_more_shows_or_that_is_surer_is_believed(
     assert names(scene) == ["soup_can" if believed else "salt_shaker"]
 
 
+@pytest.mark.parametrize(
+    ("wanted", "elsewhere", "probability", "believed"),
+    [
+        ({"soup_can"}, False, 0.95, True),
+        ({"soup_can"}, False, 0.85, False),
+        ({"soup_can", "salt_shaker"}, False, 0.95, False),
+        ({"soup_can", "salt_shaker"}, True, 0.95, True),
+        ({"salt_shaker"}, True, 0.95, False),
+    ],
+)
+def test_a_stranger_that_the_goal_wants_is_believed_if_it_is_surely_seen(
+    wanted: set[str], elsewhere: bool, probability: float, believed: bool
+) -> None:
+    """Of a can no more shows behind a carton than when it was called a salt shaker; the shaker may stand elsewhere."""
+    placed = {"soup_can": upright("soup_can", 0.06, 0.05, 0.0)}
+    placed |= {"salt_shaker": upright("salt_shaker", -0.2, 0.05, 0.0)} if elsewhere else {}
+    shaker = known({"salt_shaker": HALF_BEHIND})["salt_shaker"]
+    shaker = msgspec.structs.replace(shaker, visible=0.4, probability=0.99)
+    seen = [msgspec.structs.replace(item, visible=0.2, probability=probability) for item in graph(placed).objects]
+    if elsewhere:
+        seen[1] = msgspec.structs.replace(seen[1], name="salt_shaker_2")
+    scene = msgspec.structs.replace(graph(placed), objects=tuple(seen))
+    scene = MEMORY.complete(scene, {"salt_shaker": shaker}, observation(placed), wanted)
+    others = ["salt_shaker_2"] if elsewhere else []
+    assert names(scene) == (["soup_can", *others] if believed else [*others, "salt_shaker"])
+
+
 def test_what_stands_on_a_box_does_not_say_that_there_is_none() -> None:
     """Of a box under a sponge so little shows that it is taken for a can; the sponge is seen a millimetre too low."""
     layout = Layout().put("tea_box", 0.0, 0.0).put("sponge", 0.0, 0.0, on="tea_box")
