@@ -63,8 +63,8 @@ class Memory:
 
         A stranger at such an object's place is the object, taken for something else because little of it shows; but
         where more shows of the stranger, the object had been the mistake, as it had where a surer one that is seen
-        reaches into it. So it had where the stranger is ``wanted`` and surely seen, and the object is not wanted, or an
-        equal one is seen elsewhere.
+        reaches into it. Of two that are sure the one is believed that is ``wanted``, if the other one is not, or an
+        equal of that is seen elsewhere.
         """
         if observation.T_base_camera is None:
             return scene
@@ -76,9 +76,8 @@ class Memory:
             there = [stranger for stranger in strangers if self._overlap(item, stranger, scene)]
             false = {stranger.name for stranger in there}
             others = [other for other in scene.objects if other.name not in false]
-            mistaken = any(_clearer(stranger, item) for stranger in there)
-            if item.name not in wanted or any(other.label == item.label for other in others):
-                mistaken |= any(stranger.name in wanted and _is_sure(stranger) for stranger in there)
+            needed = item.name in wanted and not any(other.label == item.label for other in others)
+            mistaken = any(_clearer(stranger, item, (stranger.name in wanted) - needed) for stranger in there)
             mistaken |= any(_surer(other, item) and self._overlap(item, other, scene, _THROUGH) for other in others)
             if not mistaken and not self._seen_empty(item, others, observation):
                 kept.append(item)
@@ -200,18 +199,15 @@ def _view(observation: Observation) -> ObservedScene:
     return ObservedScene.of(depth, observation.foreground, observation.K, observation.T_camera_table)
 
 
-def _is_sure(item: SceneObject) -> bool:
-    return item.probability is not None and item.probability >= SURE
-
-
 def _surer(item: SceneObject, other: SceneObject) -> bool:
     """Whether an object is more likely right than another one."""
     return item.probability is not None and other.probability is not None and item.probability > other.probability
 
 
-def _clearer(stranger: SceneObject, before: SceneObject) -> bool:
+def _clearer(stranger: SceneObject, before: SceneObject, wanted: int) -> bool:
     """Whether what is seen now is believed rather than what was seen before in its place; of two doubtful guesses it is
-    the likelier one, as at what shows a few pixels under a box."""
-    if _is_sure(stranger):
-        return is_below(before, SURE) or stranger.visible >= before.visible
+    the likelier one, as at what shows a few pixels under a box. ``wanted`` is above 0 where only the stranger is, below
+    where only the other one is."""
+    if stranger.probability is not None and stranger.probability >= SURE and wanted >= 0:
+        return wanted > 0 or is_below(before, SURE) or stranger.visible >= before.visible
     return stranger.visible > _CLEARER * before.visible or (is_below(before, UNSURE) and _surer(stranger, before))
