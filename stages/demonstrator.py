@@ -154,6 +154,11 @@ class State:
     plan: Plan | None = None
     """The one that waits."""
 
+    @property
+    def taught(self) -> SceneGraph | None:
+        """The goal as it was shown; None while it is being shown."""
+        return self.whole or self.goal
+
 
 class Demonstrator(Stage):
     """Remembers a demonstrated scene as the goal and drives the robot until it holds again.
@@ -327,7 +332,7 @@ class Demonstrator(Stage):
             yield question
             return
         scene_graph = self._memory.named(scene_graph, state.known, observation, state.seen)
-        goal = state.whole or state.goal
+        goal = state.taught
         scene = self._memory.complete(scene_graph, state.known, observation, _names(goal) if goal else ())
         seen, ahead, unproved = state.seen | _names(scene_graph), state.views[1:], state.unproved
         if state.goal is not None and (not state.known or _spares(scene, state.goal)):
@@ -582,7 +587,7 @@ class Demonstrator(Stage):
 
     def _is_unlikely(self, item: SceneObject) -> bool:
         """Whether an object that the goal does not name is less likely there than not: no reason to remember it."""
-        goal = self._state.whole or self._state.goal
+        goal = self._state.taught
         return is_below(item, UNSURE) and goal is not None and item.name not in _names(goal)
 
     def _doubtful(self, scene: SceneGraph, least: float) -> list[str]:
@@ -774,7 +779,7 @@ class Demonstrator(Stage):
         state = self._state
         held: tuple[Assertion, ...] = ()
         violated: tuple[Assertion, ...] = ()
-        goal = state.whole or state.goal
+        goal = state.taught
         if goal is not None and state.scene is not None:
             held, violated = satisfied(goal, state.scene, self._catalogue)
             covered = {Assertion(predicate="clear", arguments=(name,)) for name in self._covered(goal)}
@@ -809,7 +814,7 @@ class Demonstrator(Stage):
     def _gone(self) -> list[str]:
         """What was there at the start, is in no goal, and is seen nowhere now."""
         state = self._state
-        goal = state.whole or state.goal
+        goal = state.taught
         if state.scene is None or state.first is None or goal is None:
             return []
         known = _names(state.scene) | _names(goal)

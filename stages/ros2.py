@@ -21,7 +21,7 @@ from stages.messages import (
     Verdict,
 )
 from stages.scene.catalogue import Catalogue
-from stages.scene.text import support
+from stages.scene.text import certainty, support
 
 if TYPE_CHECKING:  # whoever reads a graph does not load what speaks with ROS 2
     from stages.devices.ros2.services import Request
@@ -80,12 +80,12 @@ class Ros2Scenes(Stage):
     ) -> Ros2Sent:
         """Publishes a scene, and answers who asked for it."""
         sent = self._outlet.publish(frame, scene_estimate, scene_graph, ctx)
-        reason = scene_graph.unusable
-        text = f"nothing is known: {reason}" if reason else sentence(scene_graph)
-        ctx.log(f"{frame.name}: {text}", level="warning" if reason else "info")
+        unusable = bool(scene_graph.unusable)
+        text = certainty(scene_estimate) if unusable else sentence(scene_graph)
+        ctx.log(f"{frame.name}: {text}", level="warning" if unusable else "info")
         request = self._waiting.pop(frame.name, None)
         if request is not None:
-            sent.append(self._outlet.answer(request, success=not reason, message=text))
+            sent.append(self._outlet.answer(request, success=not unusable, message=text))
         if self._every is not None:
             self._due_ns = ctx.time_ns + int(self._every * 1e9)
         return Ros2Sent(messages=tuple(sent))

@@ -71,13 +71,17 @@ def test_a_node_asks_for_a_look_and_gets_its_scene(look: dict[str, Any]) -> None
 
 def test_who_asks_for_a_look_at_which_nothing_is_seen_is_told_why(look: dict[str, Any]) -> None:
     blind = msgspec.structs.replace(look["scene_graph"], objects=(), assertions=(), virtual_objects=())
-    blind = msgspec.structs.replace(blind, unusable="no support plane")
+    graph, estimate = (
+        msgspec.structs.replace(one, unusable="no support plane") for one in (blind, look["scene_estimate"])
+    )
     with router() as endpoint, node(endpoint, "lab") as lab:
         stage = Ros2Scenes(Ros2Scenes.Config(catalogue=BUILT_IN, link=Link(router=endpoint)))
         future = call(lab, f"{NAME}/look")
         (request,) = run_stage(stage, limit=1)
         frame = msgspec.structs.replace(look["frame"], name=request.purpose)
-        (sent,) = run_stage(stage, [{**look, "frame": frame, "scene_graph": blind}], limit=1)
+        (sent,) = run_stage(
+            stage, [{**look, "frame": frame, "scene_estimate": estimate, "scene_graph": graph}], limit=1
+        )
         response = future.result(5.0)
         stage.close()
     assert (response.success, response.message) == (False, "nothing is known: no support plane")
