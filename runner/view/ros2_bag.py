@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import msgspec
@@ -62,16 +62,14 @@ def export_bag(path: Path, target: Path) -> list[str]:
         raise Refused(f"{path}: its views {graph.view} say nothing to ROS 2; they have no method ros2")
     if target.exists():
         raise Refused(f"{target}: cannot be written: File exists")
-    part = target.with_name(f"{target.name}.part")
     try:
-        plugin = rosbag2.StoragePlugin.MCAP
-        with rosbag2.Writer(part / target.name, version=_VERSION, storage_plugin=plugin) as writer:
-            counts = _write(writer, _said(recording, graph, views))
-        (part / target.name).rename(target)
+        with TemporaryDirectory(dir=target.parent, prefix=f"{target.name}.") as part:
+            written_to, plugin = Path(part, target.name), rosbag2.StoragePlugin.MCAP
+            with rosbag2.Writer(written_to, version=_VERSION, storage_plugin=plugin) as writer:
+                counts = _write(writer, _said(recording, graph, views))
+            written_to.rename(target)
     except (rosbag2.WriterError, OSError) as error:
         raise Refused(f"{target}: cannot be written: {error}") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     written = [f"{target}: {count} messages of {topic}" for topic, count in sorted(counts.items())]
     return [f"{path}: {recording.verdict}", *(written or [f"{target}: nothing to say"])]
 

@@ -174,8 +174,11 @@ def test_a_recording_becomes_a_bag_that_others_read_and_that_is_a_camera_again(
     tmp_path: Path, reference: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frame, _, graph = reference
-    target = tmp_path / "bag"
+    target, foreign = tmp_path / "bag", tmp_path / "bag.part" / "foreign"
+    foreign.parent.mkdir()
+    foreign.touch()
     assert main(["export", str(REFERENCE), "--ros2", str(target)]) == 0
+    assert foreign.exists() and {one.name for one in tmp_path.iterdir()} == {"bag", "bag.part"}
     assert f"{target}: 1 messages of {NAME}/detections" in capsys.readouterr().out
     with AnyReader([target]) as reader:
         found = {one.topic: reader.deserialize(data, one.msgtype) for one, _, data in reader.messages()}
