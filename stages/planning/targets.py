@@ -412,14 +412,12 @@ class Targets:
             )
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
-        surface = carrier.floor if carrier.stance.cavity else carrier.top
         if margin is not None:
-            return regions.inside(item.bottom, surface, margin=margin)
-        middles = np.stack([regions.centroid(item.bottom), regions.centroid(surface)])
-        depth, deepest = regions.depth(surface, middles)
-        if depth < min(MIDDLE, 0.5 * deepest):
-            return False
-        return carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
+            held = regions.inside(item.bottom, _surface(carrier), margin=margin)
+        else:
+            on_rim = carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
+            held = on_rim and _bears(carrier, regions.centroid(item.bottom))
+        return held and _is_balanced(item, destination, scene)
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:
         """Whether all of an object, seen from above, lies over the table and away from its edge."""
@@ -483,6 +481,30 @@ class Targets:
                 T[:2, 3] = (T_table_base @ [x, y, scene.T_base_table[2, 3], 1.0])[:2]
                 spots.append(scene.rested(Standing(item.name, item.stance, T), TABLE))
         return spots
+
+
+def _surface(carrier: Standing) -> regions.Region:
+    """On which others stand."""
+    return carrier.floor if carrier.stance.cavity else carrier.top
+
+
+def _bears(carrier: Standing, middle: Floats) -> bool:
+    """Whether what weighs on an object at a place, x and y, does so far enough from the edge of its surface."""
+    surface = _surface(carrier)
+    depth, deepest = regions.depth(surface, np.stack([middle, regions.centroid(surface)]))
+    return bool(depth >= min(MIDDLE, 0.5 * deepest))
+
+
+def _is_balanced(item: Standing, destination: str, scene: Scene) -> bool:
+    """Whether a pile stands with one more object on it: each of those below bears the weight of all above it."""
+    above, below = [item], destination
+    while (support := scene.supports[below]) != TABLE:
+        above.append(scene.standing[below])
+        weights, middles = zip(*((one.stance.item.mass, regions.centroid(one.bottom)) for one in above), strict=True)
+        if not _bears(scene.standing[support], np.average(middles, axis=0, weights=weights)):
+            return False
+        below = support
+    return True
 
 
 def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:

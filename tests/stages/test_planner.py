@@ -728,6 +728,21 @@ def test_an_object_stands_wholly_on_what_carries_it_with_a_margin(upper: str):
         assert middle >= 0.01 if wide else regions.inside(item.bottom, carrier.top, margin=Workspace().clearance)
 
 
+@pytest.mark.parametrize("lower", ["soup_can", "tuna_can"])
+def test_what_is_piled_up_weighs_on_the_middle_of_all_that_is_below(lower: str):
+    """A carton has room on a sponge where the can below that, half as wide, would not bear it."""
+    goal = Layout().put(lower, 0.0, 0.0).put("sponge", 0.0, 0.0, on=lower).put("milk_carton", 0.0, 0.0, on="sponge")
+    start = Layout().put(lower, 0.0, 0.0).put("sponge", 0.0, 0.014, on=lower).put("milk_carton", 0.1, 0.25)
+    (transfer,) = plan(goal, start).transfers
+    can = Standing.at(lower, stances(lower), start.poses[lower])
+    sponge = Standing.at("sponge", stances("sponge"), start.poses["sponge"])
+    weights = [catalogue()[label].mass for label in ("sponge", "milk_carton")]
+    for T in transfer.T_base_targets:
+        carton = Standing.at("milk_carton", stances("milk_carton"), inverse(T_BASE_TABLE) @ T)
+        middles = [regions.centroid(item.bottom) for item in (sponge, carton)]
+        assert regions.depth(can.top, np.average(middles, axis=0, weights=weights)[None])[0] >= 0.01 - 1e-6
+
+
 @settings(max_examples=8)
 @given(
     st.tuples(st.floats(-0.15, 0.02), st.floats(-0.4, -0.15)), st.floats(0.15, 0.4), st.floats(-0.6, 0.6),
