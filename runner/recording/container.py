@@ -7,13 +7,15 @@ import fcntl
 import os
 import struct
 import time
-import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import IO, cast
 
+import mcap.stream_reader
+import mcap.writer
+from isal import isal_zlib
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
@@ -24,6 +26,10 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from runner.contract import Refused
+
+# Of each byte MCAP's writer takes two checksums and its reader one: in a fifteenth of the time.
+for _module in (mcap.stream_reader, mcap.writer):
+    vars(_module)["zlib"] = isal_zlib
 
 MAX_RECORD = 2**30
 """Bytes; a longer record is taken for a damaged length."""
@@ -174,7 +180,7 @@ def _records(stream: IO[bytes] | Growing, *, whole: bool = True) -> Iterator[Mca
     """
     opcode = checksum = 0
     if whole:
-        checksum = zlib.crc32(_magic(stream))
+        checksum = isal_zlib.crc32(_magic(stream))
     while opcode != Opcode.FOOTER:
         head = _exactly(stream, _HEAD.size)
         opcode, length = _HEAD.unpack(head)
@@ -186,10 +192,10 @@ def _records(stream: IO[bytes] | Growing, *, whole: bool = True) -> Iterator[Mca
             yield _compared("data section", content, checksum) if whole and any(content) else None
             checksum = 0
         elif opcode == Opcode.FOOTER:
-            yield _compared("summary", content, zlib.crc32(content[:-4], zlib.crc32(head, checksum)))
+            yield _compared("summary", content, isal_zlib.crc32(content[:-4], isal_zlib.crc32(head, checksum)))
         else:
             if whole or opcode != Opcode.CHUNK:  # No summary holds a chunk, which has a checksum of its own.
-                checksum = zlib.crc32(content, zlib.crc32(head, checksum))
+                checksum = isal_zlib.crc32(content, isal_zlib.crc32(head, checksum))
             yield _record(opcode, content)
     _magic(stream)
 

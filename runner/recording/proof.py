@@ -1,13 +1,13 @@
 """Proves from the records of a recording, one by one in the order of the file, that nothing is missing."""
 
 import itertools
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import msgspec
+from isal import isal_zlib
 
 from runner.graph.graph import SUPERVISOR, command_port
 from runner.message.codec import Envelope, LogLine, Lost, Step
@@ -265,7 +265,7 @@ class Proof:
 
 def to_enter(record: Envelope | Step | Lost | LogLine) -> tuple[Record, int]:
     """What is recorded, and of a message a checksum of what it says."""
-    return (record.id, zlib.crc32(record.body)) if isinstance(record, Envelope) else (record, 0)
+    return (record.id, isal_zlib.crc32(record.body)) if isinstance(record, Envelope) else (record, 0)
 
 
 def in_short(problems: Iterable[str]) -> str:
