@@ -134,6 +134,8 @@ class State:
     """What is looked for by putting things aside, in words."""
     searched: tuple[str, ...] = ()
     """What was put aside, or could not be, since something was found."""
+    stuck: tuple[str, ...] = ()
+    """What the hand failed to put aside since then: it is tried once more after all else."""
     stopping: bool = False
     """Somebody asked to stop: what is waited for is the last."""
     halted: bool = False
@@ -424,6 +426,9 @@ class Demonstrator(Stage):
         unproved = self._state.unproved - {outcome.object} | unfelt
         known = self._known_after(outcome)
         self._state = replace(self._state, complaint=complaint, repeats=0, known=known, unproved=unproved)
+        if self._state.missing and not outcome.success and outcome.object not in self._state.stuck:
+            searched = tuple(name for name in self._state.searched if name != outcome.object)
+            self._state = replace(self._state, searched=searched, stuck=(*self._state.stuck, outcome.object))
         return self._look(f"after transfer {outcome.number}")
 
     def on_arrived(self, arrived: Arrived, ctx: Context) -> Verdict | None:
@@ -489,6 +494,7 @@ class Demonstrator(Stage):
         if state.goal is None or state.repeats == 0 or state.transfers == self._config.max_transfers:
             return self._look_again("perception", missing, ctx)
         hidden = [name for name in self._hiders(scene, state.goal) if name not in state.searched]
+        hidden.sort(key=state.stuck.__contains__)
         if not hidden:
             return self._look_again("perception", missing, ctx)
         ctx.log(f"{missing}; looks behind and under {hidden[0]}")
@@ -629,7 +635,7 @@ class Demonstrator(Stage):
         """
         held, violated = satisfied(goal, scene, self._catalogue)
         self._check_transfer(scene, violated, ctx)
-        self._state = replace(self._state, missing="", searched=())
+        self._state = replace(self._state, missing="", searched=(), stuck=())
         from_memory = f"; remembered, not seen: {', '.join(self._state.remembered)}" if self._state.remembered else ""
         count = f"{len(held)} of {len(held) + len(violated)} goal relations hold"
         ctx.log(f"scene '{self._state.purpose}': {count}{from_memory}")

@@ -1143,6 +1143,25 @@ def test_what_may_hide_a_missing_object_is_put_aside_before_it_is_given_up() -> 
     assert verdict.failed_stage == "perception" and "not seen: salt_shaker" in verdict.reason
 
 
+def test_what_the_hand_failed_to_put_aside_is_tried_once_more_after_all_else() -> None:
+    start = Layout(dict(CARTON.poses)).put("tea_box", 0.2, -0.3)
+    goal = Layout(dict(start.poses) | {"salt_shaker": OPEN})
+    seen = msgspec.structs.replace(start.graph(), support=regions.rectangle([-0.3, -0.4], [0.3, 0.4]))
+    episode, asked = Episode(), list[str]()
+    episode.until_start(goal.graph())
+    for number in (1, 2, 3):
+        episode.seen(seen, view(start))
+        (task,) = episode.seen(seen, view(start))
+        assert isinstance(task, Task)
+        asked.append(task.aside)
+        aside = transfer(task.aside, "table", "table")
+        episode.planned(aside)
+        episode.ended(number, aside, failed_stage="touch" if task.aside == "milk_carton" else "")
+    assert asked == ["milk_carton", "tea_box", "milk_carton"]
+    episode.seen(seen, view(start))
+    assert episode.seen(seen, view(start)) == [LookRequest(purpose="after transfer 3, look 3")]
+
+
 def test_what_is_in_the_way_of_that_is_put_aside_once() -> None:
     start = Layout(dict(CARTON.poses)).put("tea_box", 0.2, -0.3)
     goal = Layout(dict(start.poses) | {"salt_shaker": OPEN})
