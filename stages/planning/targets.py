@@ -28,6 +28,8 @@ TOUCHING = 0.002
 """Objects whose heights overlap by less than this are above each other, metres."""
 MIDDLE = 0.01
 """Metres from the edge of a surface, half of the way on small ones, where the middle of what overhangs it must stay."""
+SLOPE = 0.004
+"""Metres by which the side of a bottom that lies on the wall of a hollow may be higher than its floor."""
 HIDDEN = 0.1
 """Cost of a place that other objects hide wholly from the camera, in metres of shift: nobody has seen it free, and
 nobody will see what stands there."""
@@ -401,7 +403,7 @@ class Targets:
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
         """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle. What would
-        lie on a rim lies there on both sides: on one it would tip into the hollow.
+        lie on a rim lies there on both sides: on one it would tip into the hollow, as on the slope of its wall.
 
         The table always carries all of it, not far beyond where the arm is known to reach.
         """
@@ -413,7 +415,7 @@ class Targets:
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         if margin is not None:
-            held = regions.inside(item.bottom, _surface(carrier), margin=margin)
+            held = regions.inside(item.bottom, _surface(carrier), margin=margin) and _is_level(carrier, item.bottom)
         else:
             on_rim = carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
             held = on_rim and _bears(carrier, regions.centroid(item.bottom))
@@ -486,6 +488,11 @@ class Targets:
 def _surface(carrier: Standing) -> regions.Region:
     """On which others stand."""
     return carrier.floor if carrier.stance.cavity else carrier.top
+
+
+def _is_level(carrier: Standing, bottom: regions.Region) -> bool:
+    """Whether a bottom lies on the floor of a hollow, if there is one, and not partly on the slope of its wall."""
+    return carrier.rest_height(bottom) - carrier.rest_height(carrier.centred(bottom)) < SLOPE
 
 
 def _bears(carrier: Standing, middle: Floats) -> bool:

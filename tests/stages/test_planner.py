@@ -728,6 +728,18 @@ def test_an_object_stands_wholly_on_what_carries_it_with_a_margin(upper: str):
         assert middle >= 0.01 if wide else regions.inside(item.bottom, carrier.top, margin=Workspace().clearance)
 
 
+@pytest.mark.parametrize("item", ["salt_shaker", "sauce_bottle"])
+def test_what_goes_into_a_bowl_is_not_put_on_the_slope_of_its_wall(item: str):
+    goal = Layout().put("bowl", 0.0, 0.0).put(item, 0.0, 0.0, on="bowl")
+    start = Layout().put("bowl", 0.0, 0.0).put(item, 0.1, 0.25)
+    (transfer,) = plan(goal, start).transfers
+    bowl = Standing.at("bowl", stances("bowl"), start.poses["bowl"])
+    flat = bowl.rest_height(bowl.centred(Standing.at(item, stances(item), goal.poses[item]).bottom))
+    for T in transfer.T_base_targets:
+        placed = Standing.at(item, stances(item), inverse(T_BASE_TABLE) @ T)
+        assert bowl.rest_height(placed.bottom) - flat < 0.004
+
+
 @pytest.mark.parametrize("lower", ["soup_can", "tuna_can"])
 def test_what_is_piled_up_weighs_on_the_middle_of_all_that_is_below(lower: str):
     """A carton has room on a sponge where the can below that, half as wide, would not bear it."""
