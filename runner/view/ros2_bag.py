@@ -63,6 +63,7 @@ def export_bag(path: Path, target: Path) -> list[str]:
     if target.exists():
         raise Refused(f"{target}: cannot be written: File exists")
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f"{target.name}.") as part:
             written_to, plugin = Path(part, target.name), rosbag2.StoragePlugin.MCAP
             with rosbag2.Writer(written_to, version=_VERSION, storage_plugin=plugin) as writer:

@@ -417,8 +417,9 @@ class Targets:
         if margin is not None:
             held = regions.inside(item.bottom, _surface(carrier), margin=margin) and _is_level(carrier, item.bottom)
         else:
-            on_rim = carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
-            held = on_rim and _bears(carrier, regions.centroid(item.bottom))
+            held = _bears(carrier, regions.centroid(item.bottom)) and (
+                carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
+            )
         return held and _is_balanced(item, destination, scene)
 
     def _on_table(self, item: Standing, scene: Scene) -> bool:

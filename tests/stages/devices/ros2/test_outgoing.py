@@ -196,6 +196,10 @@ def test_a_recording_becomes_a_bag_that_others_read_and_that_is_a_camera_again(
     assert np.array_equal(again.K, frame.K)
 
 
+def test_a_bag_is_written_into_a_folder_that_is_not_there_yet(tmp_path: Path) -> None:
+    assert main(["export", str(REFERENCE), "--ros2", str(tmp_path / "new" / "bag")]) == 0
+
+
 def test_what_cannot_be_exported_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(REFERENCE), "--ros2", str(tmp_path)]) == 2
     assert f"{tmp_path}: cannot be written: File exists" in capsys.readouterr().err
