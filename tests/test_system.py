@@ -136,7 +136,7 @@ def test_root_installs_what_is_missing(bare: Path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "Installing xvfb chromium git\n", "")
     update, install = calls.read_text().splitlines()
     assert update == "update -qq"
-    assert install == "install --yes --no-install-recommends xvfb chromium git -qq"
+    assert install == "install --yes --no-install-recommends xvfb chromium git -qq -o DPkg::Lock::Timeout=300"
 
 
 def test_others_install_with_sudo_or_are_told_what_to_type(bare: Path):
