@@ -14,7 +14,7 @@ from runner.contract import Context, Refused, Stage
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import pose
 from stages.messages import Candidate, Hypothesis, ObjectPose, Observation, Posterior
-from stages.messages.digest import LoneCandidate, LoneEstimate, LonePose, ParticleTrace
+from stages.messages.digest import LoneCandidate, LoneEstimate, LonePose, ParticleTrace, Search
 from stages.perception.cuda.device import DEVICES, chosen_device
 from stages.perception.filter.likelihood import ObservedScene
 from stages.perception.filter.particle_filter import Track
@@ -103,7 +103,7 @@ class ParticleFilter(Stage):
     def on_hypothesis(self, hypothesis: Hypothesis, observation: Observation, ctx: Context) -> Posterior:
         """The most likely scene of the hypothesis and its unnormalised weight."""
         scene = self._scene(observation)
-        suspects = [_suspect(candidate) for candidate in hypothesis.candidates]
+        suspects = _suspects(hypothesis.candidates, hypothesis.search)
         starts = [_track(start) for start in hypothesis.starts]
         reached = self._reached(scene, hypothesis)
         search = hypothesis.search
@@ -169,7 +169,7 @@ class ParticleFilter(Stage):
         """What a scene of the hypothesis may cost and still weigh as much as the known one."""
         if not hypothesis.starts:
             return np.inf
-        suspects = [_suspect(placed.candidate) for placed in hypothesis.incumbent]
+        suspects = _suspects([placed.candidate for placed in hypothesis.incumbent], hypothesis.search)
         poses = [placed.T_camera_object[:3] for placed in hypothesis.incumbent]
         # For the incumbent itself the charges cancel exactly.
         difference = hypothesis.incumbent_charged - hypothesis.charged
@@ -178,6 +178,13 @@ class ParticleFilter(Stage):
 
 def _suspect(candidate: Candidate) -> Suspect:
     return Suspect(candidate.label, candidate.box)
+
+
+def _suspects(candidates: Sequence[Candidate], search: Search | None) -> list[Suspect]:
+    """The candidates of one scene; boxes of its label that frame none of them may frame an object too."""
+    taken = {candidate.box.tobytes() for candidate in candidates}
+    free = [offer.candidate for offer in search.offers if offer.candidate.box.tobytes() not in taken] if search else []
+    return [Suspect(c.label, c.box, tuple(f.box for f in free if f.label == c.label)) for c in candidates]
 
 
 def _object(name: str, candidate: Candidate, found: Found) -> ObjectPose:

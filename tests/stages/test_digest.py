@@ -316,6 +316,24 @@ def test_two_equal_objects_that_the_detector_frames_as_one_are_two(yaw: float, f
     assert [item.label for item in estimate.objects] == ["sponge", "sponge"]
 
 
+@pytest.mark.parametrize("yaw", [0.1, 0.2, 0.25])
+def test_an_object_that_the_detector_frames_twice_is_one(yaw: float, filter_stage: ParticleFilter) -> None:
+    """The top and the front of a box that stands on a sponge: either frame alone shows less than the box explains."""
+    upper = upright("tea_box", 0.0, 0.0, yaw)
+    upper[2, 3] += CATALOGUE["sponge"].dimensions[2]
+    tower = render({"tea_box": upper, "sponge": upright("sponge", 0.0, 0.0, 0.2)})
+    x0, y0, x1, y1 = tower.boxes["tea_box"]
+    edge = 0.6 * y0 + 0.4 * y1
+    top, front = np.array([x0, y0, x1, edge]), np.array([x0, edge, x1, y1])
+    found = candidates(("tea_box", top, 0.95), ("tea_box", front, 0.9), ("sponge", tower.boxes["sponge"], 0.9))
+    config = Hypotheses.Config(n_objects="auto", suggestions=True)
+    (observation, *hypotheses), _ = enumerate_(config, frame(tower), found, filter_stage)
+    estimate = ranked(config, hypotheses, filter_stage, observation)
+    assert sorted(item.label for item in estimate.objects) == ["sponge", "tea_box"]
+    for item in estimate.objects:
+        assert np.linalg.norm((item.T_camera_object - tower.poses[item.label])[:3, 3]) < 0.01
+
+
 def test_what_nothing_explains_is_looked_for_though_no_box_shows_it(filter_stage: ParticleFilter) -> None:
     """A cup half behind a carton, that the detector does not see at all."""
     partly = {"cereal_box": upright("cereal_box", 0.0, 0.0, 0.3), "cup": upright("cup", 0.09, 0.09, 0.0)}

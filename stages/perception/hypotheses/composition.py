@@ -24,15 +24,16 @@ _LEAST = 0.1
 class Composition:
     """The objects of one hypothesis in one observation, each with the part of the image that it may explain.
 
-    An object takes credit only inside its candidate's grown box; elsewhere it costs what it misses and leaves the
+    An object takes credit only inside its candidate's grown boxes; elsewhere it costs what it misses and leaves the
     readings as unexplained as they were. Readings outside all of the boxes therefore stay unexplained whatever the
     poses, and their credit is a lower bound of the cost (:meth:`bound`).
     """
 
-    def __init__(self, scene: ObservedScene, form: CostForm, boxes: Sequence[Floats]) -> None:
+    def __init__(self, scene: ObservedScene, form: CostForm, boxes: Sequence[Sequence[Floats]]) -> None:
+        """``boxes`` are those of each object."""
         self.scene = scene
         self._form = form
-        self._reaches = [_mask(scene, pixels(box, scene, margin=REACH)) for box in boxes]
+        self._reaches = [_mask(scene, [pixels(box, scene, margin=REACH) for box in each]) for each in boxes]
         self.credit = credits(scene, scene.plane_inverse, form)
         """What each pixel costs with the plane alone, H x W metres."""
 
@@ -156,7 +157,7 @@ def glimpse(scene: ObservedScene, layer: Float32s, box: Floats, form: CostForm) 
     """What one candidate's object would show alone: its H x W layer, and what the scene's cost changes by."""
     shown = layer > scene.plane_inverse
     rows, columns = part = part_of(shown[::PATCH_STRIDE, ::PATCH_STRIDE])
-    composition = Composition(scene, form, [box])
+    composition = Composition(scene, form, [[box]])
     change = np.where(shown, composition.pixels([layer]) - composition.pixels([], []), 0.0)
     inverse, change = (np.where(shown, a, 0.0)[::PATCH_STRIDE, ::PATCH_STRIDE][part] for a in (layer, change))
     return DepthPatch(
@@ -193,10 +194,10 @@ class FirstLook:
         return _sum(self._change) * PATCH_STRIDE**2 + sum(self._charges[i] for i in chosen)
 
 
-def _mask(scene: ObservedScene, rectangle: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    x0, y0, x1, y1 = rectangle
+def _mask(scene: ObservedScene, rectangles: Sequence[tuple[int, int, int, int]]) -> NDArray[np.bool_]:
     inside = np.zeros(scene.depth.shape, bool)
-    inside[y0:y1, x0:x1] = True
+    for x0, y0, x1, y1 in rectangles:
+        inside[y0:y1, x0:x1] = True
     return inside
 
 

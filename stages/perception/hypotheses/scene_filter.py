@@ -39,7 +39,9 @@ class Suspect:
 
     label: str
     box: Floats
-    """x0, y0, x1, y1 in pixels."""
+    """x0, y0, x1, y1 in pixels; the object is sought here."""
+    others: tuple[Floats, ...] = ()
+    """Boxes that may frame the same object: a detector sometimes frames one object twice, its top and its front."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ class SceneFilter:
         """What the scene of first looks costs, poses 3 x 4; estimating its hypothesis ends no higher."""
         key = self._observation_key(scene, 0)
         for suspect, start in zip(suspects, starts, strict=True):
-            key = _extended_by(_extended(key, suspect), start.tobytes())
+            key = _extended_by(_extended(key, suspect), b"".join(each.tobytes() for each in (start, *suspect.others)))
         cost = self._costs.get(key)
         if cost is None:
             layers = [self._layer(scene, s, pose) for s, pose in zip(suspects, starts, strict=True)]
@@ -287,7 +289,7 @@ class SceneFilter:
         return draft.others_reached(i) if draft.take(i, track, layer) else set()
 
     def _composition(self, scene: ObservedScene, suspects: Sequence[Suspect]) -> Composition:
-        return Composition(scene, self._settings.cost, [suspect.box for suspect in suspects])
+        return Composition(scene, self._settings.cost, [(s.box, *s.others) for s in suspects])
 
     def _result(
         self, scene: ObservedScene, tracks: Sequence[Track], layers: Sequence[Float32s], cost: float, *,

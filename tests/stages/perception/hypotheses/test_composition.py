@@ -56,12 +56,12 @@ def test_no_scene_costs_less_than_the_bound(
         moved = seen.poses[label][:3, 3] + rng.normal(0, spread, 3)
         moved[2] = max(moved[2], 0.3)
         layers.append(layer(shapes, label, np.column_stack([turned, moved])))
-    composition = Composition(seen.scene, FORM, [seen.boxes[label] for label in sorted(chosen)])
+    composition = Composition(seen.scene, FORM, [[seen.boxes[label]] for label in sorted(chosen)])
     assert composition.cost(layers) >= composition.bound() - 1e-6
 
 
 def test_the_bound_is_what_the_missing_objects_leave_unexplained(seen: Rendered, shapes: dict[str, Shape]) -> None:
-    boxes = list(seen.boxes.values())
+    boxes = [[box] for box in seen.boxes.values()]
     complete = Composition(seen.scene, FORM, boxes)
     assert complete.bound() < complete.cost(true_layers(seen, shapes)) < 0.2 * complete.cost_of_nothing()
     lacking = Composition(seen.scene, FORM, boxes[:2])
@@ -72,12 +72,27 @@ def test_the_bound_is_what_the_missing_objects_leave_unexplained(seen: Rendered,
 
 def test_boxes_limit_what_an_object_explains(seen: Rendered, shapes: dict[str, Shape]) -> None:
     layers = true_layers(seen, shapes)
-    wide = Composition(seen.scene, FORM, [EVERYTHING] * 3)
+    wide = Composition(seen.scene, FORM, [[EVERYTHING]] * 3)
     assert wide.cost(layers) == scene_cost(seen.scene, layers, FORM)
-    fitting = Composition(seen.scene, FORM, list(seen.boxes.values()))
+    fitting = Composition(seen.scene, FORM, [[box] for box in seen.boxes.values()])
     assert fitting.cost(layers) == pytest.approx(wide.cost(layers), rel=0.05)
-    exchanged = Composition(seen.scene, FORM, list(reversed(seen.boxes.values())))
+    exchanged = Composition(seen.scene, FORM, [[box] for box in reversed(seen.boxes.values())])
     assert exchanged.cost(layers) > 0.5 * exchanged.cost_of_nothing()
+
+
+def test_an_object_in_two_boxes_explains_what_is_in_both(seen: Rendered, shapes: dict[str, Shape]) -> None:
+    layers = true_layers(seen, shapes)
+    x0, y0, x1, y1 = seen.boxes["tea_box"]
+    middle = (y0 + y1) / 2
+    halves = [np.array([x0, y0, x1, middle]), np.array([x0, middle, x1, y1])]
+
+    def composition(tea_box: list[Floats]) -> Composition:
+        return Composition(seen.scene, FORM, [tea_box if n == "tea_box" else [box] for n, box in seen.boxes.items()])
+
+    twice, whole = composition(halves), composition([seen.boxes["tea_box"]])
+    assert twice.bound() <= twice.cost(layers) == pytest.approx(whole.cost(layers), rel=0.05)
+    for half in halves:
+        assert composition([half]).cost(layers) > 1.2 * twice.cost(layers)
 
 
 def test_the_first_look_costs_what_the_composition_costs(seen: Rendered, shapes: dict[str, Shape]) -> None:
@@ -85,7 +100,7 @@ def test_the_first_look_costs_what_the_composition_costs(seen: Rendered, shapes:
     look = FirstLook([glimpse(seen.scene, *each, FORM) for each in zip(layers, boxes, strict=True)])
     for size in range(4):
         for chosen in itertools.combinations(range(3), size):
-            composition = Composition(seen.scene, FORM, [boxes[i] for i in chosen])
+            composition = Composition(seen.scene, FORM, [[boxes[i]] for i in chosen])
             change = composition.cost([layers[i] for i in chosen]) - composition.cost_of_nothing()
             assert look.cost(chosen) == pytest.approx(change, rel=0.1, abs=0.2 * PATCH_STRIDE**2)
 
