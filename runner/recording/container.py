@@ -285,13 +285,15 @@ def open_file(path: Path) -> IO[bytes]:
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Generator[IO[bytes]]:
-    """A file to write that has its name only once all of it is written; a kill leaves ``PATH.PID.part``.
+    """A file to write, in a folder made for it where there is none, that has its name only once all of it is written; a
+    kill leaves ``PATH.PID.part``.
 
     Raises Refused where the name is taken, also meanwhile, or writing fails.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         _require_free(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as unfinished:
             with part.open("xb") as file:
                 unfinished.callback(part.unlink)

@@ -119,6 +119,13 @@ def test_nothing_is_overwritten_and_nothing_that_still_grows_is_copied(toys: Pat
     session.stop()
 
 
+def test_a_new_file_may_go_into_a_folder_that_is_not_there_yet(tmp_path: Path):
+    path = tmp_path / "foo" / "bar" / "baz"
+    with new_file(path) as file:
+        file.write(b"qux")
+    assert [path.read_bytes(), *path.parent.iterdir()] == [b"qux", path]
+
+
 def test_files_of_others_beside_the_new_one_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path, foreign = tmp_path / "a.mcap", tmp_path / "a.mcap.part"
     foreign.write_bytes(b"foreign")
