@@ -146,6 +146,16 @@ def test_trajectories_respect_the_limits() -> None:
     assert motion.times[-1] < 10
 
 
+@settings(max_examples=25, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**31))
+def test_at_corners_the_hand_stays_on_the_way_that_was_checked(scene: CollisionWorld, seed: int) -> None:
+    turns = np.random.default_rng(seed).normal(scale=0.25, size=(2, len(HOME)))
+    waypoints = np.clip(HOME + np.vstack([np.zeros(len(HOME)), turns.cumsum(0)]), scene.lower, scene.upper)
+    checked = np.array([scene.hand(q)[:3, 3] for q in densify(waypoints, 0.001)])
+    followed = np.array([scene.hand(q)[:3, 3] for q in time_parameterise(ROBOT, waypoints).positions])
+    assert max(np.linalg.norm(checked - one, axis=1).min() for one in followed) < 1.5e-3
+
+
 def test_the_held_object_collides_too(scene: CollisionWorld) -> None:
     target = above_table(0.6, 0.2)
     target[2, 3] = 0.70 + 0.150 + 0.06
