@@ -14,7 +14,7 @@ from stages.geometry.poses import inverse, raised
 from stages.messages.task import FailedStage, Transfer
 from stages.planning.motion.collision import CollisionWorld
 from stages.planning.motion.grasps import HandPose, approaches, distinct_grasps, hand_poses
-from stages.planning.motion.motion import free_motion, restarts, solve_ik, straight_motion
+from stages.planning.motion.motion import free_motion, is_motion_free, restarts, solve_ik, straight_motion
 from stages.robots import Robot, Table
 from stages.scene.catalogue import CatalogueObject, Grasp
 
@@ -210,15 +210,16 @@ class PickPlacePlanner:
             yield PickPlace(pick, place, reach, carry)
 
     def _carry(self, pick: Pick, place: Place) -> Floats | None:
-        """At best with room below for an object that slides down in the hand."""
+        """At best with room below for what slides down in the hand, and free for what does not in any case."""
         hand = pick.hand
         T_base_object = hand.T_base_hand @ inverse(hand.T_object_hand)
         for slid in (SLID, 0.0):
             T_hand_object = inverse(hand.T_base_hand) @ raised(T_base_object, -slid)
             with self._world.holding(T_hand_object, hand.grasp.width):
                 carry = free_motion(self._world, pick.lift[-1], place.lower[0], self._rng)
-            if carry is not None:
-                return carry
+            with self.holding(hand):
+                if carry is not None and is_motion_free(self._world, carry):
+                    return carry
         return None
 
     def _picks(self, grasp: Grasp, start: Floats) -> Iterator[Pick]:

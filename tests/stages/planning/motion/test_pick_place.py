@@ -77,6 +77,17 @@ def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> Non
         assert is_motion_free(world, plan.carry)
 
 
+@pytest.mark.parametrize("y", [0.02, 0.03, 0.04])
+def test_what_does_not_slide_in_the_hand_is_carried_past_others_too(y: float) -> None:
+    """A cup past a mug on a can: 6 cm lower it would pass below the mug, beside the can, which is slimmer."""
+    poses = {"cup": standing("cup", 0.745, -0.059), "soup_can": standing("soup_can", 0.702, y)}
+    poses["mug"] = standing("mug", 0.705, y, yaw=1.6, height=TABLE.height + catalogue()["soup_can"].dimensions[2])
+    for world, planner in ways("cup", poses, standing("cup", 0.595, 0.009)):
+        for plan in islice(planner.plans(ROBOT.home), 6):
+            with planner.holding(plan.pick.hand):
+                assert is_motion_free(world, plan.carry)
+
+
 def test_what_the_gripper_does_not_take_is_no_grasp() -> None:
     box = catalogue()["sugar_box"]
     robot = read_robot(BUILT_IN.with_name("ur5e.yaml"))
