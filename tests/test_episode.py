@@ -81,8 +81,6 @@ def test_a_zenoh_subscriber_hears_every_message_of_the_job_once_and_byte_for_byt
         "--set",
         "world.seed=3",
         "--set",
-        "corrector.calibrate=false",  # the job above calibrates; here it would only take longer
-        "--set",
         f"listen={address}",
         "--recordings",
         str(tmp_path),

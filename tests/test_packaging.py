@@ -32,6 +32,7 @@ GRAPHS = {
     "calibrate": (),
     "calibrate_arm": (),
     "bag": ("--set", "camera.bag=d"),
+    "arm": (),
     "ros2": (),
     "reference": (),
     "photos": ("--set", "camera.dataset=d", "--set", "results.path=d.csv"),

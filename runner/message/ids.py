@@ -40,6 +40,12 @@ class MessageId(msgspec.Struct, frozen=True, order=True, gc=False):
         return f"{self.stage}.{self.port}#{self.sequence}"
 
 
+def numbered(id: str) -> tuple[str, int]:
+    """Of a recorded id ``stage.port`` and the sequence: no more than the proof needs of every message."""
+    source, _, sequence = id.rpartition("#")
+    return source, int(sequence)
+
+
 def number_on(numbers: dict[str, int], ids: Iterable[str]) -> None:
     """Has the next sequence numbers, by port, go on after the ids of one stage."""
     for one in map(MessageId.of, ids):

@@ -11,6 +11,7 @@ from isal import isal_zlib
 
 from runner.graph.graph import SUPERVISOR, command_port
 from runner.message.codec import Envelope, LogLine, Lost, Step
+from runner.message.ids import numbered
 from runner.recording.intervals import Intervals
 
 Record = str | Step | Lost | LogLine
@@ -134,11 +135,11 @@ class Proof:
 
     def want(self, id: str) -> None:
         """A message that should be recorded."""
-        self._want(*_numbered(id))
+        self._want(*numbered(id))
 
     def message(self, id: str, content: int = 0) -> None:
         """A recorded message."""
-        port, number = _numbered(id)
+        port, number = numbered(id)
         if number not in self._emitted[port]:
             self._contents.setdefault(id, content)
         if self._contents.get(id, content) != content:
@@ -157,17 +158,17 @@ class Proof:
         if step.outcome == "ended":
             process.ended = step.number
         for id in step.emitted:
-            port, number = _numbered(id)
+            port, number = numbered(id)
             self._emitted[port].add(number)
             self._want(port, number)
             if step.outcome != "failed":
                 self._contents.pop(id, None)
         for input, id in step.consumed:
-            port, number = _numbered(id)
+            port, number = numbered(id)
             self._take(step, input, port, number)
             self._want(port, number)
         for input, id in step.left:
-            self._take(step, input, *_numbered(id))
+            self._take(step, input, *numbered(id))
 
     def lost(self, lost: Lost) -> None:
         """A process that was killed may have sent messages of a step that it never journalled."""
@@ -301,9 +302,3 @@ def _name(topic: str, record: Record) -> str:
             return f"step {record.number} of {record.process.path}"
         case _:
             return f"a record of {topic}"
-
-
-def _numbered(id: str) -> tuple[str, int]:
-    """The port of a message, ``stage.port``, and its number."""
-    port, _, number = id.rpartition("#")
-    return port, int(number)

@@ -17,7 +17,7 @@ from runner.contract import Message, Refused
 from runner.graph.document import suggest
 from runner.graph.graph import SUPERVISOR, Graph
 from runner.message.codec import CodecError, Envelope, LogLine, Lost, Step, open_envelope, unpack
-from runner.message.ids import IdText, MessageId
+from runner.message.ids import IdText, MessageId, numbered
 from runner.recording.container import Container, Entry, is_being_written, open_file
 from runner.recording.migrations import migrated, migrations_of
 from runner.recording.proof import Proof, Record, in_short, to_enter
@@ -304,8 +304,8 @@ class Recording:
         wanted = MessageId.of(id)
         same_port = sorted(other for other in map(MessageId.of, self.messages) if other.topic == wanted.topic)
         if not same_port:
-            ports = {id.partition("#")[0] for id in self.messages}
-            raise Refused(f"{self.path}: no message {id!r}{suggest(id.partition('#')[0], ports)}")
+            ports = {source for source, _ in map(numbered, self.messages)}
+            raise Refused(f"{self.path}: no message {id!r}{suggest(f'{wanted.stage}.{wanted.port}', ports)}")
         near = sorted(same_port, key=lambda other: abs(other.sequence - wanted.sequence))[:3]
         raise Refused(
             f"{self.path}: no message {id!r}; the nearest: {', '.join(map(str, sorted(near)))} "

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -388,7 +389,7 @@ class _ChunkIndex:
 
     def write(self, stream: RecordBuilder) -> None:
         self._file.seek(0)
-        stream.write(self._file.read())
+        shutil.copyfileobj(self._file, stream)
 
 
 def _named(record: Recorded) -> tuple[str, Record]:

@@ -115,6 +115,20 @@ class FragileSplitter(Stage):
                 os.kill(os.getpid(), signal.SIGKILL)
 
 
+class FragileRelay(Stage):
+    """Sends each number on; of every second one its first process dies, while what it sent last is on its way."""
+
+    Config = Mortality
+
+    def __init__(self, config: Mortality):
+        self._config = config
+
+    def on_number(self, number: Number) -> Iterator[Number]:
+        if number.value % 2 and first_time(self._config.marks / str(number.value)):
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield number
+
+
 class Listener(Worker):
     """Hears numbers besides its pieces; the first of its processes to hear a three dies of it a little later."""
 

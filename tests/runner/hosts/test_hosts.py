@@ -262,9 +262,17 @@ def test_a_stateful_stage_gets_its_state_back_on_its_host(parties, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_path: Path):
-    """Killed between what it journals and what it sends, again and again: the replicas of each host get all parts."""
-    graph = changed(HOSTS, tmp_path, Splitter="FragileSplitter")
+@pytest.mark.parametrize("fragile", ["splitter", "relay"])
+def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_path: Path, fragile: str):
+    """Killed between what it journals and what it sends, again and again: the replicas of each host get all parts, and
+    what every replica is to hear."""
+    if fragile == "splitter":
+        graph = changed(HOSTS, tmp_path, Splitter="FragileSplitter")
+    else:
+        relay = "relay: {stage: tests.runner.common.survivors:FragileRelay, inputs: {number: counter.number}}"
+        relayed = HOSTS.read_text().replace("counter.number", "relay.number")
+        graph = tmp_path / HOSTS.name
+        graph.write_text(relayed.replace("stages:\n", f"stages:\n  {relay}\n"))
     results: list[str] = []
     for name in ("calm", "rough"):
         folder = tmp_path / name
@@ -273,12 +281,12 @@ def test_what_a_publisher_took_with_it_is_sent_again_to_every_host(parties, tmp_
             for number in range(20):
                 (folder / str(number)).touch()
         party = parties(on_loopback(), folder, graph=graph)
-        party.start_all("counter.count=20", f"splitter.marks={folder}", "splitter.restarts=20")
+        party.start_all("counter.count=20", f"{fragile}.marks={folder}", f"{fragile}.restarts=20")
         head = party.end("head")
         assert head.code == 0, head.output
         assert Recording(head.recording).verdict.complete
         results.append((folder / "out.txt").read_text())
-    assert (results[0], head.output.count("splitter restarts (")) == (results[1], 10)
+    assert (results[0], head.output.count(f"{fragile} restarts (")) == (results[1], 10)
 
 
 @pytest.mark.slow
