@@ -13,6 +13,8 @@ _SLOTS = [(x, y) for x in (-0.127, 0.0, 0.127) for y in (-0.065, 0.065)]
 """Metres in the tray's frame: with all of them taken the tray is full."""
 _ORDERED = 20
 """Draws of a full tray after which its objects change places: whether all are in sight is a matter of their order."""
+_IN_CIRCLE = 500
+"""Draws of a start after which the tray's objects have changed places in any way, not each to that of the next."""
 
 
 class Swap(Drawn):
@@ -45,30 +47,35 @@ class Swap(Drawn):
         self._draws[kind] += 1
         if kind == "goal" and self._exchange == self._tray and self._draws[kind] > _ORDERED:
             self._parts = rng.permutation(self._parts).tolist()
-        self._exchange(kind, draft)
+        self._exchange(kind, draft, rng)
         for name in self._beside:
             put(draft, name)
 
-    def _circle(self, kind: Kind, draft: Draft) -> None:
+    def _circle(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         """Each on the carrier of the next one."""
         for name in self._carriers:
             put(draft, name)
         for k, name in enumerate(self._parts):
             put(draft, name, self._carriers[(k + (kind == "start")) % len(self._carriers)])
 
-    def _tower(self, kind: Kind, draft: Draft) -> None:
+    def _tower(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
         support = "table"
         for name in self._parts if kind == "goal" else self._parts[::-1]:
             put(draft, name, support)
             support = name
 
-    def _tray(self, kind: Kind, draft: Draft) -> None:
-        """Every slot taken, at the start by the next object, or by one farther on."""
+    def _tray(self, kind: Kind, draft: Draft, rng: np.random.Generator) -> None:
+        """Every slot taken, at the start by the next object, by one farther on, or by any other."""
         put(draft, "tray")
         T = draft.placed["tray"].T_table_stance
         yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-        onward = 1 + self._draws["start"] // _ORDERED % (len(_SLOTS) - 1) if kind == "start" else 0
-        for k, name in enumerate(self._parts):
-            slot = _SLOTS[(k + onward) % len(_SLOTS)]
-            if not draft.put_at(name, "tray", (T @ [*slot, 0, 1])[:2], yaw):
+        shown = slots = np.arange(len(_SLOTS))
+        if kind == "start":
+            slots = np.roll(shown, -1 - self._draws[kind] // _ORDERED % (len(_SLOTS) - 1))
+        if kind == "start" and self._draws[kind] > _IN_CIRCLE:
+            slots = rng.permutation(shown)
+            if (slots == shown).any():
+                raise Rejected("an object where the goal has it")
+        for name, k in zip(self._parts, slots, strict=True):
+            if not draft.put_at(name, "tray", (T @ [*_SLOTS[k], 0, 1])[:2], yaw):
                 raise Rejected("no room in sight")

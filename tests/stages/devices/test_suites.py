@@ -192,9 +192,9 @@ def test_what_belongs_beside_the_tray_is_in_sight_there() -> None:
     assert not any(there.placed for there in goal.moved_with(with_tray(0.7, -0.3)))
 
 
-@pytest.mark.parametrize("seed", [443, 452, 577])
+@pytest.mark.parametrize("seed", [443, 452, 577, pytest.param(722, marks=pytest.mark.slow)])
 def test_a_full_tray_is_drawn_until_all_is_in_sight(seed: int) -> None:
-    """Here that takes hundreds of draws, or only succeeds where objects go farther than to the next place."""
+    """It takes hundreds of draws, or only succeeds where objects go farther than to the next place, or anywhere."""
     goal, start, _ = looks("swap", seed)
     assert sorted(goal.names) == sorted(start.names)
     where = [dict(zip(each.names, each.T_base_objects, strict=True)) for each in (goal, start)]
