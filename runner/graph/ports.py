@@ -29,6 +29,8 @@ class Handler:
     inputs: tuple[InputPort, ...]
     context: str | None
     """Name of the parameter that receives the step's context."""
+    outputs: tuple[type[Message], ...]
+    """What its result's annotation announces."""
 
     @cached_property
     def is_command(self) -> bool:
@@ -83,8 +85,7 @@ def inspect_stage(cls: type[Stage]) -> StageType:
     if not handlers and source is None:
         raise Refused(f"{cls.__name__}: has no handlers; a handler is a method named on_*")
     refuse_shared(cls.__name__, ((port.name, handler.name) for handler in handlers for port in handler.inputs))
-    methods = [handler.name for handler in handlers] + (["source"] if source else [])
-    emitted = [kind for name in methods for kind in _message_types(_hints(cls, name)["return"])]
+    emitted = [kind for handler in (*handlers, *([source] if source else [])) for kind in handler.outputs]
     refuse_shared(cls.__name__, ((port_name(kind), f"{kind.__module__}:{kind.__qualname__}") for kind in emitted))
     for kind in (*emitted, *(port.type for handler in handlers for port in handler.inputs)):
         if reason := _why_no_message(kind):
@@ -115,13 +116,14 @@ def _handler_names(cls: type[Stage]) -> list[str]:
 def _handler(cls: type[Stage], name: str) -> Handler:
     inputs: list[InputPort] = []
     context: str | None = None
-    for parameter, annotation in list(_hints(cls, name).items())[:-1]:
+    *parameters, (_, result) = _hints(cls, name).items()
+    for parameter, annotation in parameters:
         if annotation is Context:
             context = parameter
         else:
             inputs.append(_input_port(cls, name, parameter, annotation))
     _refuse_inputs(cls, name, inputs)
-    return Handler(name, tuple(inputs), context)
+    return Handler(name, tuple(inputs), context, tuple(_message_types(result)))
 
 
 def _hints(cls: type[Stage], name: str) -> dict[str, Any]:

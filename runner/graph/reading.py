@@ -27,7 +27,7 @@ from runner.graph.graph import (
 )
 from runner.graph.packaged import locate
 from runner.graph.placement import check_listen, read_layout
-from runner.graph.ports import InputPort, StageType, inspect_stage, refuse_shared
+from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_shared
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
 T = TypeVar("T")
@@ -324,17 +324,37 @@ def _node(document: Document, name: str, entry: StageEntry, kind: StageType) -> 
     config = _read(kind.config, entry.config, document, (*keys, "config")) if kind.config else None
     placement = _placement(document, name, entry)
     replicas = len(os.sched_getaffinity(0)) if entry.replicas == "auto" else max(entry.replicas, len(placement))
-    parts = [port.name for port in kind.inputs.values() if issubclass(port.type, Part) and port.kind == "one"]
-    if (entry.replicas != 1 or replicas != 1) and not parts:
+    if reason := (entry.replicas != 1 or replicas != 1) and _why_single(kind):
         place = document.place(*keys, "replicas" if entry.replicas != 1 else "host")
-        raise Refused(f"{place}: {entry.stage} takes no Part, which is what replicas share")
+        raise Refused(f"{place}: {entry.stage} {reason}; valid: 1")
     restarts = entry.restarts if entry.restarts is not None else 0 if kind.cls.device else RESTARTS
-    if kind.cls.stateful and replicas > 1:
-        place = document.place(*keys, "replicas")
-        raise Refused(f"{place}: {entry.stage} is stateful: replicas would remember different things; valid: 1")
     edges = _edges(document, name, entry, kind)
     limits = msgspec.convert(entry, Limits, from_attributes=True)
     return Node(name, entry.stage, kind, config, edges, replicas, restarts, limits, placement)
+
+
+def _why_single(kind: StageType) -> str:
+    """Why a stage cannot have replicas; empty where it can.
+
+    They share parts, and what answers a part has the part's number, whoever worked: so what a port sends must all
+    answer parts of one port.
+    """
+    if kind.cls.stateful:
+        return "is stateful: replicas would remember different things"
+    handlers = (*kind.handlers, *([kind.source] if kind.source else []))
+    if not any(issubclass(port.type, Part) and port.kind == "one" for port in kind.inputs.values()):
+        return "takes no Part, which is what replicas share"
+    emitters: dict[str, str] = {}
+    for handler in handlers:
+        for port in handler.inputs:
+            if port.kind == "gather":
+                return f"gathers {port.name}, and no replica would get all of them"
+        for output in map(port_name, handler.outputs):
+            if not handler.inputs:
+                return f"emits {output} in {handler.name}, and each replica would send its own"
+            if (other := emitters.setdefault(output, handler.name)) != handler.name:
+                return f"emits {output} in {other} and in {handler.name}, and both answers would have one number"
+    return ""
 
 
 def _placement(document: Document, name: str, entry: StageEntry) -> tuple[str, ...]:

@@ -306,8 +306,13 @@ def test_two_publishers_of_all_joints_are_named_though_one_tells_no_efforts() ->
         time.sleep(0.1)
         with node(endpoint, "sliders") as other:
             publisher, stopping = other.publisher(WHERE.joint_states, JOINTS), threading.Event()
-            thread = threading.Thread(target=babble, args=(other, publisher, stopping, NAMES, HOME.tolist()))
-            threading.Timer(0.3, thread.start).start()
+
+            def open_window() -> None:
+                wait_until(lambda: bool(robot.arm.goals))
+                babble(other, publisher, stopping, NAMES, HOME.tolist())
+
+            thread = threading.Thread(target=open_window)
+            thread.start()
             state = state_of(stage, turn(0.05, 2.0))
             stopping.set()
             thread.join()

@@ -11,9 +11,10 @@ import yaml
 from runner.cli.main import main
 from runner.contract import Refused, Stage
 from runner.graph.graph import Graph, graph_to_json, mermaid
+from runner.graph.ports import inspect_stage
 from runner.graph.reading import graph_from_json, graph_schema, load_graph
 from tests.runner.common.runs import ACCOUNT, TOYS
-from tests.runner.common.toys import Add, Answer, Collect, Number, Piece
+from tests.runner.common.toys import Add, Answer, Collect, Counter, Number, Piece, Splitter
 
 ROOT = Path(__file__).parents[3]
 OUT = "sink.path=out.txt"
@@ -150,6 +151,53 @@ def test_who_answers_no_parts_may_take_the_latest(tmp_path: Path):
 """
     graph = load(tmp_path, OUT, old="  watcher:\n", new=f"{onlooker}  watcher:\n")
     assert graph.nodes["onlooker"].inputs["piece"].policy == "latest"
+
+
+class TwoHandlers(Alone):
+    """Answers numbers as it answers pieces."""
+
+    def on_number(self, number: Number) -> Answer:
+        return Answer(index=0, count=1, samples=np.full(1, number.value))
+
+
+class Gathers(Alone):
+    """Hears all of the pieces, too."""
+
+    def on_pieces(self, pieces: list[Piece]) -> Number: ...
+
+
+class Begins(Alone):
+    """Says something before it hears anything."""
+
+    def on_start(self) -> Number: ...
+
+
+class Remembers(Alone):
+    stateful = True
+
+
+@pytest.mark.parametrize(
+    ("stage", "reason"),
+    [
+        ("TwoHandlers", "emits answer in on_piece and in on_number, and both answers would have one number; valid: 1"),
+        ("Gathers", "gathers pieces, and no replica would get all of them; valid: 1"),
+        ("Begins", "emits number in on_start, and each replica would send its own; valid: 1"),
+        ("Remembers", "is stateful: replicas would remember different things; valid: 1"),
+    ],
+)
+def test_what_replicas_cannot_share_is_refused(tmp_path: Path, stage: str, reason: str):
+    inputs = {"piece": "splitter.piece", "pieces": "splitter.piece", "number": "counter.number"}
+    given = {port: inputs[port] for port in inspect_stage(globals()[stage]).inputs}
+    stages = {
+        "counter": {"stage": f"{Counter.__module__}:Counter"},
+        "splitter": {"stage": f"{Splitter.__module__}:Splitter", "inputs": {"number": "counter.number"}},
+        "worker": {"stage": f"{__name__}:{stage}", "inputs": given},
+    }
+    path = tmp_path / "graph.yaml"
+    path.write_text(yaml.safe_dump({"name": "shared", "stages": stages}))
+    assert load_graph(path).nodes["worker"].replicas == 1
+    with pytest.raises(Refused, match=f"worker.replicas: {__name__}:{stage} {reason}"):
+        load_graph(path, ["worker.replicas=2"])
 
 
 @pytest.mark.parametrize(
