@@ -3,24 +3,29 @@
 import contextlib
 import queue
 import threading
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 
 from runner.graph.graph import Node
 from runner.message import codec
 from runner.message.codec import CodecError, Deal, Envelope
-from runner.message.ids import Recent
+from runner.message.ids import REMEMBERED, numbered
 from runner.message.packet import Packet
 from runner.message.refusals import Refusals
 from runner.process.inbox import Inbox, Mismatched
 from runner.process.step import receive
+from runner.recording.intervals import Intervals
+
+Consumed = tuple[str, str, tuple[tuple[int, int], ...]]
+"""A port, what its messages come from, and ranges of their numbers: the first, and one after the last."""
 
 
 class Intake:
     """Takes packets from the threads of the bus and, on the thread that runs steps, decodes them into the inbox."""
 
-    def __init__(self, node: Node, refusals: Refusals, *, consumed: Iterable[tuple[str, str]], is_new: bool):
-        """``consumed`` is what earlier processes have done with, (port, id). Unless the process ``is_new``, what comes
-        waits until the recorder has sent again what is older.
+    def __init__(self, node: Node, refusals: Refusals, *, consumed: Iterable[Consumed], is_new: bool):
+        """``consumed`` is what earlier processes have done with. Unless the process ``is_new``, what comes waits until
+        the recorder has sent again what is older.
         """
         self.inbox = Inbox(node)
         self._node = node
@@ -28,9 +33,11 @@ class Intake:
         self._mailbox = _Mailbox(node)
         self._parts = _Parts()
         self._shared = {port for port in node.inputs if node.shares(port)}
-        self._arrived = Recent[tuple[str, str], None]()
-        """(port, id) of what has arrived, so that it is worked on once."""
-        self._arrived.update(dict.fromkeys(one for one in consumed if not node.keeps(one[0])))
+        self._arrived = defaultdict[tuple[str, str], Intervals](Intervals)
+        """Numbers of what has arrived, by port and what it comes from, so that it is worked on once."""
+        for port, source, ranges in consumed:
+            if not node.keeps(port):
+                self._arrived[port, source] |= ranges
         self._left: list[tuple[str, str]] = []
         """(port, id) of what was refused since that was last taken."""
         self._catching_up = threading.Lock()
@@ -97,7 +104,8 @@ class Intake:
         try:
             envelope = codec.unpack(Envelope, packet.payload)
             id = envelope.id
-            if (name, id) in self._arrived:
+            source, number = numbered(id)
+            if number in self._arrived[name, source]:
                 return
             port = self._node.type.inputs.get(name)
             if port is None:
@@ -109,7 +117,10 @@ class Intake:
             if id:
                 self._left.append((name, id))
         if id:
-            self._arrived[name, id] = None
+            source, number = numbered(id)
+            arrived = self._arrived[name, source]
+            arrived.add(number)
+            arrived.keep(REMEMBERED)
 
     def take_left(self) -> tuple[tuple[str, str], ...]:
         """(port, id) of what was refused, or put aside without having been part of a step, since the last call."""

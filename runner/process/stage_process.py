@@ -31,7 +31,7 @@ from runner.process.delivery import Delivery, Stopped
 from runner.process.forks import EXIT_FAILED
 from runner.process.health import Heartbeat
 from runner.process.inbox import Ready
-from runner.process.intake import Intake
+from runner.process.intake import Consumed, Intake
 from runner.process.past import bring_back, past_of
 from runner.process.step import Executor, step_time
 from runner.recording.recording import Recording
@@ -82,8 +82,8 @@ class Assignment(msgspec.Struct, frozen=True):
     """Next sequence number by output port, where an earlier process has emitted some."""
     started: bool = False
     """True where an earlier process has run the start handlers."""
-    consumed: tuple[tuple[str, str], ...] = ()
-    """(port, id) of the newest that earlier processes have consumed: it may be sent again, and is not worked on."""
+    consumed: tuple[Consumed, ...] = ()
+    """What earlier processes have consumed: it may be sent again, and is not worked on."""
 
 
 class StageProcess:

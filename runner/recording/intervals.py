@@ -63,6 +63,11 @@ class Intervals:
         self._starts[touched] = [min([number, *self._starts[touched]])]
         self._stops[touched] = [max([number + 1, *self._stops[touched]])]
 
+    def keep(self, most: int) -> None:
+        """Lets go of the lowest ranges where there are twice as many as ``most``."""
+        if len(self._starts) > 2 * most:
+            del self._starts[:-most], self._stops[:-most]
+
     def discard(self, number: int) -> None:
         """Takes a number out where it is in."""
         at = bisect_right(self._starts, number) - 1

@@ -1,6 +1,8 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
 import signal
+import threading
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,10 +10,15 @@ from runner.graph.graph import Limits
 from runner.hosts.head import RemoteChild
 from runner.inspect.info import byte_count
 from runner.message.codec import Pulse, Step, answered
-from runner.message.ids import Recent, number_on
+from runner.message.ids import REMEMBERED, number_on, numbered
 from runner.message.packet import Process
 from runner.process.children import Handle, ending, last_lines
 from runner.process.health import Watch, oom_kills
+from runner.process.intake import Consumed
+from runner.recording.intervals import Intervals
+
+RESENT = 1000
+"""Of the messages that may come once more, the ranges that a successor is told, of each port."""
 
 
 @dataclass(slots=True)
@@ -67,15 +74,28 @@ class Progress:
         self.started = False
         self.done = 0
         """Steps that were done."""
-        self.consumed = Recent[tuple[int, str, str], None]()
-        """(replica, port, id) of what the stage has done with lately."""
+        self._consumed = defaultdict[tuple[int, str, str], Intervals](Intervals)
+        """Numbers of what the stage has done with, by replica, port and what it comes from."""
+        self._noting = threading.Lock()
 
     def note(self, step: Step) -> None:
         """Takes a step that the recorder has; only what was done counts."""
-        for port, id in answered(step):
-            self.consumed[step.replica, port, id] = None
+        with self._noting:
+            for port, id in answered(step):
+                source, number = numbered(id)
+                consumed = self._consumed[step.replica, port, source]
+                consumed.add(number)
+                consumed.keep(REMEMBERED)
         if step.outcome != "done":
             return
         self.done += 1
         self.started |= not step.consumed
         number_on(self.numbers, step.emitted)
+
+    def consumed(self) -> list[tuple[int, Consumed]]:
+        """What each replica has done with; of what comes with gaps, the newest. May be asked from any thread."""
+        with self._noting:
+            return [
+                (replica, (port, source, tuple(numbers)[-RESENT:]))
+                for (replica, port, source), numbers in self._consumed.items()
+            ]

@@ -16,9 +16,6 @@ from runner.process.stage_process import Assignment
 from runner.recording.writer import Manifest, topic
 from runner.supervise.child import Child, Progress
 
-RESENT = 1000
-"""Of the messages that may come once more, those that a successor is told."""
-
 
 @dataclass(frozen=True, slots=True)
 class Run:
@@ -121,8 +118,8 @@ class Launcher:
         run = self._run
         node = run.graph.nodes[process.stage]
         consumed = [
-            (port, id)
-            for replica, port, id in list(progress.consumed)  # to which another thread adds
+            (port, source, numbers)
+            for replica, (port, source, numbers) in progress.consumed()
             if replica == process.replica or (port in node.inputs and node.shares(port))
         ]
         has_past = process.incarnation > 0 and run.remembers(process.stage)
@@ -139,7 +136,7 @@ class Launcher:
             incarnation=process.incarnation,
             numbers=dict(progress.numbers),
             started=progress.started,
-            consumed=tuple(consumed[-RESENT:]),
+            consumed=tuple(consumed),
             gateway=run.gateway,
             network=run.network,
             past=str(run.recording.absolute()) if has_past else "",

@@ -54,3 +54,11 @@ def test_a_million_numbers_that_arrive_a_little_out_of_order_take_one_range():
         made.add(number + 1)
         made.add(number)
     assert list(made) == [(0, 1_000_000)]
+
+
+def test_of_numbers_with_gaps_the_highest_are_kept():
+    made = Intervals()
+    for number in range(0, 1000, 2):
+        made.add(number)
+        made.keep(10)
+    assert 10 <= len(made) <= 20 and 998 in made and 982 in made and 0 not in made

@@ -33,7 +33,7 @@ def test_steps_may_be_noted_while_a_successor_is_told_of_those_before(tmp_path: 
     monkeypatch.setattr(Node, "shares", note)
     with contextlib.closing(launcher):
         told = launcher._assignment(Process("worker", 1, 1), progress)
-    assert told.consumed == (("piece", "splitter.piece#0"),)
+    assert told.consumed == (("piece", "splitter.piece", ((0, 1),)),)
     numbers_told = dict(told.numbers)
     note()
     assert told.numbers == numbers_told
