@@ -240,10 +240,16 @@ def signal_group(group: int, signum: int) -> None:
 
 
 def last_lines(log: Path, count: int, start: int = 0) -> list[str]:
-    """The last lines of what a child printed that say something; ``start`` is where its part of the file begins."""
-    with log.open("rb") as file:
-        file.seek(max(start, log.stat().st_size - TAIL_BYTES))
-        lines = file.read().decode(errors="replace").splitlines()
+    """The last lines of what a child printed that say something; ``start`` is where its part of the file begins.
+
+    None where the file cannot be read: somebody may have moved or deleted it.
+    """
+    try:
+        with log.open("rb") as file:
+            file.seek(max(start, log.stat().st_size - TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return []
     return list(_telling(lines))[-count:]
 
 

@@ -144,18 +144,14 @@ class RecordingWriter:
         self._proof = Proof(json.loads(manifest.graph))
         self._proving = threading.Lock()
         self._file = _create(path)
-        self._index_file = tempfile.TemporaryFile(buffering=0, dir=path.parent)  # noqa: SIM115 - see _write_all
-        # A chunk ends in _flush.
-        self._writer = Writer(
-            self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4, enable_data_crcs=True
-        )
-        own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
-        vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
-        self._writer.start(profile=PROFILE)
         run = run_metadata(manifest)
         self._run_hash = hash_of(run)
-        self._writer.add_metadata(RUN, run)
-        self._writer.flush()
+        try:
+            self._begin(path.parent, run)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            raise Refused(f"recording {path}: cannot be written: {error.strerror}") from None
         self._container = Container(self._file, str(path))
         """Knows the channels that have been read back."""
         self._proved = MAGIC_SIZE
@@ -179,6 +175,19 @@ class RecordingWriter:
         """Whether the file has been written to its end."""
         self._thread = threading.Thread(target=self._write_all, name="recording", daemon=True)
         self._thread.start()
+
+    def _begin(self, folder: Path, run: dict[str, str]) -> None:
+        """Writes the head of the file."""
+        self._index_file = tempfile.TemporaryFile(buffering=0, dir=folder)  # noqa: SIM115 - see _write_all
+        # A chunk ends in _flush.
+        self._writer = Writer(
+            self._file, chunk_size=sys.maxsize, compression=CompressionType.LZ4, enable_data_crcs=True
+        )
+        own = {"chunk_indices": _ChunkIndex(self._index_file), "chunk_builder": _ChunkBuilder()}
+        vars(self._writer).update({f"_Writer__{name}": part for name, part in own.items()})
+        self._writer.start(profile=PROFILE)
+        self._writer.add_metadata(RUN, run)
+        self._writer.flush()
 
     def put(self, record: Recorded, data: bytes | memoryview) -> None:
         """Takes one record and its bytes as they came over the bus."""

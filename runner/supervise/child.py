@@ -1,5 +1,6 @@
 """The processes of a run as their supervisor knows them: how they are, why they ended, what their successors need."""
 
+import os
 import signal
 import threading
 from collections import defaultdict
@@ -58,11 +59,21 @@ class Child:
         code = self.handle.returncode or 0
         if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
             return lines[0]
+        if code > 0 and _is_full(self.log):
+            return f"{ending(code)}: the disk of {self.log} is full"
         elsewhere = isinstance(self.handle, RemoteChild)  # whose kernel's count nobody here knows
         if code != -signal.SIGKILL or elsewhere or oom_kills() == self.oom_kills:
             return ending(code)
         held = f"; it last held {byte_count(newest.memory_bytes)}" if newest is not None else ""
         return f"{ending(code)}: the kernel was out of memory{held}"
+
+
+def _is_full(log: Path) -> bool:
+    """Whether the disk has no room for what a process would say."""
+    try:
+        return os.statvfs(log).f_bavail == 0
+    except OSError:
+        return False
 
 
 class Progress:

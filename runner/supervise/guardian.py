@@ -1,8 +1,9 @@
 """Looks after the processes of a run: has them started, watches them, replaces what dies and ends them all."""
 
+import contextlib
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from runner.contract import EXIT_REFUSED, Level, Refused, Restarted
@@ -97,25 +98,31 @@ class Guardian:
     # ------------------------------------------------------------------------------------------ from start to end
 
     def start_recorder(self, *, view: bool) -> None:
-        """Starts the recorder and, once there is a recording, the viewer if wanted."""
+        """Starts the recorder and, once there is a recording, the viewer if wanted; raises Refused where one cannot be
+        started."""
         process = Process(RECORDER, 0)
         self._started[process] = time.monotonic()
-        self._recorder = self._launch.recorder(process)
+        with _starting(RECORDER):
+            self._recorder = self._launch.recorder(process)
         while view and not self._run.recording.exists():
             if self._recorder.handle.poll() is not None:
                 return
             time.sleep(TICK_SECONDS)
         if view:
-            self._viewer = self._launch.viewer()
+            with _starting("the viewer"):
+                self._viewer = self._launch.viewer()
             self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
 
     def start_stages(self) -> None:
-        """Starts every process of the graph."""
+        """Starts every process of the graph; raises Refused where one cannot be started."""
         for stage, replica in self._graph.processes():
             self._children[stage, replica] = self._start(Process(stage, replica))
 
     def look(self) -> End | None:
-        """Kills what hangs and replaces what has died; returns why the graph ends where that is not possible."""
+        """Kills what hangs and replaces what has died; returns why the graph ends where that is not possible.
+
+        Raises Refused where a successor cannot be started.
+        """
         if self._recorder is not None:
             self._check(self._recorder)
             if self._recorder.handle.poll() is not None:
@@ -171,7 +178,7 @@ class Guardian:
                 end_process(child.handle, grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
-        return "" if self._recorder is None else self._recorder.reason()
+        return "was not begun" if self._recorder is None else self._recorder.reason()
 
     def _report_lost(self, child: Child) -> None:
         """Says that a process has ended otherwise than in order; where it has, the recorder has its own word, or lacks
@@ -278,7 +285,8 @@ class Guardian:
 
     def _start(self, process: Process) -> Child:
         self._started[process] = time.monotonic()
-        return self._launch.stage(process, self._progress[process.stage])
+        with _starting(self._run.name_of(process)):
+            return self._launch.stage(process, self._progress[process.stage])
 
     def _look_after_hosts(self, hosts: Hosts) -> End | None:
         """Says who is waited for; ends the graph where one that is needed stays away."""
@@ -348,3 +356,12 @@ class Guardian:
     def _show_output(self, child: Child) -> None:
         for line in last_lines(child.log, SHOWN_LINES, child.log_from):
             self._terminal.show(self._run.name_of(child.process), f"| {line}", "error")
+
+
+@contextlib.contextmanager
+def _starting(name: str) -> Generator[None]:
+    """Raises Refused where a process cannot be made, or its log: the folder has gone, or its disk is full."""
+    try:
+        yield
+    except OSError as error:
+        raise Refused(f"{name} cannot be started: {error}") from None

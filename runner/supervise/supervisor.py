@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from runner.contract import Finished, Level, Message, Refused, Restarted
+from runner.contract import EXIT_REFUSED, Finished, Level, Message, Refused, Restarted
 from runner.graph.graph import FINISHED, SUPERVISOR, Graph, Route
 from runner.graph.placement import ALONE
 from runner.graph.ports import port_name
@@ -123,6 +123,8 @@ class Supervisor:
                 self._hosts.open(self.id, self._run.recording)
             self._guardian.start_stages()
             end = self._watch()
+        except Refused as refusal:  # a process that cannot be started
+            end = End(EXIT_REFUSED, str(refusal))
         finally:
             verdict = self._stop()
         end = self._conclude(end, verdict)

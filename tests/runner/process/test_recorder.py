@@ -174,6 +174,18 @@ def test_a_recording_that_cannot_be_created_is_refused(tmp_path: Path):
     session.bus.close()
 
 
+def test_a_recording_that_cannot_be_begun_is_refused(tmp_path: Path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))  # which the recorder inherits; as a full disk
+    try:
+        session = Session(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert session.process.wait(20) == EXIT_REFUSED
+    assert last_lines(session.log, 1) == [f"recording {session.path}: cannot be written: File too large"]
+    session.bus.close()
+
+
 @pytest.mark.parametrize("where", ["taker", "speaker"])
 def test_a_recorder_that_fails_ends_and_the_recording_says_why(tmp_path: Path, where: str, pictures: list[Picture]):
     session = Session(tmp_path, "tests.runner.process.fails", where)

@@ -1,5 +1,8 @@
 """What the supervisor does at the end, also while one of its links stands still."""
 
+import errno
+import os
+import re
 import signal
 import threading
 from pathlib import Path
@@ -15,6 +18,7 @@ from runner.message.codec import Step
 from runner.message.packet import Process
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
 from runner.supervise.child import Child
+from runner.supervise.registry import runs
 from runner.supervise.supervisor import Supervisor
 from runner.terminal import Terminal
 from tests.runner.common.runs import ACCOUNT, TOYS
@@ -32,6 +36,29 @@ def test_a_run_that_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(Refused, match=r"file/account-.*: Not a directory"):
         supervisor_of(ACCOUNT, tmp_path / "file")
     assert [path.name for path in (tmp_path / "runner").iterdir()] == ["naming"]
+
+
+def test_a_process_that_cannot_be_started_ends_the_graph_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    supervisor = supervisor_of(ACCOUNT, tmp_path)
+
+    def start(*_: object, log: Path, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(log))
+
+    supervisor._guardian._launch._forks.start = start
+    end = supervisor.run()
+    reason = rf"recorder cannot be started: .* No space left on device: '{tmp_path}/.*/log/recorder-0.txt'"
+    assert end.code == 2
+    assert re.fullmatch(reason, end.reason)
+    assert supervisor.id not in [entry.run for entry in runs()]
+
+
+def test_why_a_process_ended_that_had_no_room_to_say_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "log").touch()
+    child = Child(Process("recorder", 0), cast("Any", SimpleNamespace(returncode=2)), tmp_path / "log")
+    assert child.reason() == "ended with exit code 2"
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=0))
+    assert child.reason() == f"ended with exit code 2: the disk of {tmp_path / 'log'} is full"
 
 
 def test_a_call_that_ends_the_graph_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

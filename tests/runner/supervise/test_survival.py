@@ -17,6 +17,7 @@ from runner.message.ids import MessageId
 from runner.process.children import DESCENT, Descendants
 from runner.process.forks import clean_environment
 from runner.recording.recording import Recording
+from runner.supervise.registry import runs
 from runner.testing import read_until
 from tests.runner.common.machines import Party, on_loopback
 from tests.runner.common.runs import ALBUM, DOUBLES, TOYS, Run, changed, finish, pid_of, processes_of, run, start
@@ -129,6 +130,33 @@ def test_without_its_recorder_a_graph_ends(tmp_path: Path):
     ended = finish(process, tmp_path, before)
     assert (ended.code, ended.output.splitlines()[-1]) == (1, "the recorder killed by SIGKILL")
     assert not Recording(ended.recording).verdict.complete
+    assert processes_of(tmp_path) == []
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_run_whose_folder_is_moved_ends_in_order(tmp_path: Path, killed: bool):
+    folder, moved = tmp_path / "here", tmp_path / "there"
+    folder.mkdir()
+    process = start(
+        DOUBLES, folder, "counter.count=40", "counter.period=0.05", "sink.count=40", f"sink.path={os.devnull}"
+    )
+    before = read_until(process, "processes are ready")
+    doubler = pid_of(folder, "doubler-0")
+    folder.rename(moved)
+    if killed:
+        os.kill(doubler, signal.SIGKILL)
+    ended = finish(process, moved, before)
+    match = re.search(r"run (\S+) on unixsock-stream/(\S+)", before)
+    assert match is not None
+    last = ended.output.splitlines()[-1]
+    assert "Traceback" not in ended.output
+    if killed:
+        assert (ended.code, last.partition(": ")[0]) == (2, "doubler cannot be started"), ended.output
+    else:
+        assert (ended.code, last) == (0, "40 doubles"), ended.output
+    assert Recording(ended.recording).verdict.complete
+    assert match[1] not in [entry.run for entry in runs()]
+    assert not Path(match[2]).parent.exists()
     assert processes_of(tmp_path) == []
 
 
