@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import msgspec
 
@@ -84,7 +84,7 @@ class Command(Message, frozen=True, kw_only=True):
 class Finished(Message, frozen=True, kw_only=True):
     """Ends the graph. ``code`` becomes the exit status (0 success), ``reason`` the last line printed."""
 
-    code: int
+    code: Annotated[int, msgspec.Meta(ge=0, le=255)]
     reason: str
 
 

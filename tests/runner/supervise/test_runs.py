@@ -99,6 +99,13 @@ def test_the_code_of_the_end_is_the_exit_status(tmp_path: Path):
     assert run(TOYS, tmp_path, "sink.code=1", "counter.count=1").code == 1
 
 
+def test_a_code_that_no_exit_status_can_be_is_no_success(tmp_path: Path):
+    wrong = run(TOYS, tmp_path, "sink.code=256", "counter.count=1")
+    assert wrong.code == 1
+    last = wrong.output.splitlines()[-1]
+    assert last.startswith("sink failed after 0 restarts: CodecError: Finished.code: Expected `int` <= 255 ("), last
+
+
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_leaves_a_complete_recording_and_no_process(tmp_path: Path, signum: signal.Signals):
     process = start(DOUBLES, tmp_path, "counter.count=100000", "counter.period=0.005", "sink.count=100000")
