@@ -29,18 +29,18 @@ class Terminal:
     """
 
     def __init__(
-        self, stream: TextIO = sys.stdout, *, verbose: bool = False, needs_reader: bool = False, waits: bool = True
+        self, stream: TextIO | None = None, *, verbose: bool = False, needs_reader: bool = False, waits: bool = True
     ):
-        """``verbose`` shows lines of level debug, too, and every line stays. ``needs_reader`` raises OSError where the
-        lines cannot be printed any more.
+        """Prints to ``stream``, the standard output by default. ``verbose`` shows lines of level debug, too, and every
+        line stays. ``needs_reader`` raises OSError where the lines cannot be printed any more.
 
         Unless it ``waits`` for its reader a thread prints, until it is closed: where the reader stands still, only who
         prints does.
         """
-        self._stream = stream
+        self._stream = stream or sys.stdout
         self._verbose = verbose
         self._needs_reader = needs_reader
-        self._seen = stream.isatty()
+        self._seen = self._stream.isatty()
         self._colours = self._seen and not os.environ.get("NO_COLOR")
         self._progress: dict[str, str] = {}
         """The newest line of everybody who has one."""

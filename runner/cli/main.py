@@ -14,11 +14,13 @@ EXIT_INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status; what is refused is one line on stderr."""
+    _open_what_is_closed()
     built, names = parser()
     complete_and_exit(built)
     sys.path.insert(0, os.getcwd())  # noqa: PTH109 - as `python -m` does: stages beside the graph can be named
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        _refuse_other_bytes(*given, sys.path[0])
         options = built.parse_args(["up", *given] if _names_a_graph(given, names) else given)
         options.arguments = given
         command: Command = options.command
@@ -30,6 +32,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+
+
+def _open_what_is_closed() -> None:
+    """Opens standard streams that were closed (``>&-``): what is opened next would be taken for them."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(nowhere, mode, closefd=False))  # noqa: SIM115 - a descriptor, as Python does
+
+
+def _refuse_other_bytes(*texts: str) -> None:
+    """Refuses what is typed, and the folder in which it is, where it is not UTF-8: messages could not hold it."""
+    for text in texts:
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            raise Refused(f"{text!r}: is not UTF-8") from None
 
 
 def _names_a_graph(given: Sequence[str], commands: Collection[str]) -> bool:

@@ -48,8 +48,8 @@ class Document:
         if not equals:
             raise Refused(f"--set {assignment}: expected key=value, for example --set camera.dataset=DIR")
         try:
-            value = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError):
+            value = _with_names(read_yaml(text))
+        except (ValueError, RecursionError):
             value = text
         keys = self._keys_of(key)
         _nested(self.values, keys[:-1])[keys[-1]] = value
@@ -59,7 +59,8 @@ class Document:
         stage, dot, setting = key.partition(".")
         if not dot:
             return (key,)
-        stages = self.values.get("stages") or {}
+        found = self.values.get("stages")
+        stages = found if isinstance(found, dict) else {}
         if stage == "hosts" and stage not in stages:
             return ("hosts", setting)
         if stage not in stages:
@@ -69,11 +70,32 @@ class Document:
         return ("stages", stage, "config", *setting.split("."))
 
 
+class _Loader(yaml.SafeLoader):
+    """Raises ValueError where a value is none of its type, or a text that cannot be written as UTF-8."""
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            value = super().construct_object(node, deep)
+        except (LookupError, AttributeError):  # from within the library, of `!!bool x` and `!!timestamp x`
+            raise ValueError(f"{node.value!r} is no {node.tag.rpartition(':')[2]}") from None
+        if isinstance(value, str):
+            value.encode()
+        return value
+
+
+def read_yaml(text: str) -> Any:
+    """What YAML makes of a text; raises ValueError where that is nothing."""
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(str(error)) from None
+
+
 def read_document(path: Path) -> Document:
     """Reads a YAML graph file; raises Refused with file and line where it is not a mapping of unique keys."""
     document = Document(str(path), path.parent.absolute(), {})
     try:
-        loader = yaml.SafeLoader(path.read_text())
+        loader = _Loader(path.read_text())
         root = loader.get_single_node()
         if not isinstance(root, yaml.MappingNode):
             raise Refused(f"{path}:1: expected a mapping with name and stages")
@@ -99,22 +121,32 @@ def suggest(wrong: str, valid: Iterable[str]) -> str:
     return f"{hint} valid: {', '.join(names) or 'none'}"
 
 
-def _read_node(loader: yaml.SafeLoader, node: yaml.Node, document: Document, keys: Keys) -> Any:
+def _read_node(loader: _Loader, node: yaml.Node, document: Document, keys: Keys) -> Any:
     document.lines.setdefault(keys, node.start_mark.line + 1)
     if not isinstance(node, yaml.MappingNode):
-        try:
-            return loader.construct_object(node, deep=True)
-        except ValueError as error:  # a date or number that is none
-            raise Refused(f"{document.place(*keys)}: {error}") from None
+        return _construct(loader, node, document, keys)
     values: dict[str, Any] = {}
     for key_node, value_node in node.value:
-        key = str(loader.construct_object(key_node))
+        key = str(_construct(loader, key_node, document, keys))
         if key in values:
             line = key_node.start_mark.line + 1
             raise Refused(f"{document.label}:{line}: {'.'.join((*keys, key))}: this key appears twice")
         document.lines[(*keys, key)] = key_node.start_mark.line + 1
         values[key] = _read_node(loader, value_node, document, (*keys, key))
     return values
+
+
+def _construct(loader: _Loader, node: yaml.Node, document: Document, keys: Keys) -> Any:
+    try:
+        return loader.construct_object(node, deep=True)
+    except ValueError as error:  # a date or number that is none
+        place = f"{document.label}:{node.start_mark.line + 1}: {'.'.join(keys) or 'graph'}"
+        raise Refused(f"{place}: {error}") from None
+
+
+def _with_names(value: Any) -> Any:
+    """The same with texts as keys, as those of the file are."""
+    return {str(key): _with_names(inner) for key, inner in value.items()} if isinstance(value, dict) else value
 
 
 def _nested(values: dict[str, Any], keys: Keys) -> dict[str, Any]:

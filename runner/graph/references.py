@@ -67,6 +67,8 @@ def _is_version(key: Any) -> bool:
 
 
 def _module(name: str, place: str) -> Any:
+    if name[:1] in ("", "."):  # relative, to nothing
+        raise Refused(f"{place}: no module {name!r}")
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

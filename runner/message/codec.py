@@ -406,13 +406,25 @@ def _array_in_place(raw: msgspec.Raw) -> np.ndarray:
 
 
 def pack(record: Envelope | Step | Journal | CaughtUp | Deal | Lost | LogLine | Pulse) -> bytes:
-    """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many."""
-    payload = _ENCODER.encode(record)
+    """A record's bytes, on the wire and in a recording alike; raises CodecError where they are too many.
+
+    Texts may hold what UTF-8 cannot, as names of files do that are not UTF-8: that is spelled out.
+    """
+    try:
+        payload = _ENCODER.encode(record)
+    except UnicodeEncodeError:
+        payload = _ENCODER.encode(_spelled_out(record))
     try:
         _check_size(len(payload))
     except ValueError as error:
         raise _codec_error(type(record).__name__, error) from None
     return payload
+
+
+def _spelled_out(record: R) -> R:
+    values = ((name, getattr(record, name)) for name in record.__struct_fields__)
+    texts = {name: text.encode(errors="backslashreplace").decode() for name, text in values if isinstance(text, str)}
+    return msgspec.structs.replace(record, **texts)
 
 
 def unpack(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
-import yaml
 
 from runner.contract import Command, Level, Refused
-from runner.graph.document import suggest
+from runner.graph.document import read_yaml, suggest
 from runner.graph.graph import Graph, Node, command_port
 from runner.graph.ports import port_name
 from runner.message.codec import CodecError, LogLine, Step
@@ -236,10 +235,10 @@ def _value(place: str, name: str, kind: Any, text: str) -> Any:
     except msgspec.ValidationError as error:
         reason = str(error)
     try:
-        return msgspec.convert(yaml.safe_load(text), kind)
+        return msgspec.convert(read_yaml(text), kind)
     except msgspec.ValidationError as error:
         reason = str(error)
-    except yaml.YAMLError:
+    except ValueError:  # nothing that YAML knows
         pass
     raise Refused(f"{place}: {name}={text}: {reason.partition(' - at `')[0]}; valid: {_spelled(kind)}")
 

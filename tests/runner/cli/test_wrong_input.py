@@ -61,6 +61,17 @@ def no_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["logs", "--run", "toys", "--recordings", "."], "runner logs: --run NAME or --recordings DIR, not both"),
         (["page", "--port", "99999"], "argument --port: '99999': must be 0 to 65535"),
         (["call", "account", "add", "amount=1", "amount=2"], "amount=2: amount is given twice"),
+        (["check", "a\udcff.yaml"], "'a\\udcff.yaml': is not UTF-8"),
+        (["check", *GRAPH, "worker.seconds=\udcff"], "'worker.seconds=\\udcff': is not UTF-8"),
+        (["logs", "--recordings", "a\udcff"], "'a\\udcff': is not UTF-8"),
+        (["call", "account", "add", "note=\udcff"], "'note=\\udcff': is not UTF-8"),
+        (["restart", "\udcff"], "'\\udcff': is not UTF-8"),
+        (["check", *GRAPH, "view=!!timestamp 1"], "--set view: '!!timestamp 1' does not fit (module:Class)"),
+        (["check", *GRAPH, "stages={1: 2}"], "--set stages: a stage's name is lower case letters"),
+        (["check", *GRAPH, "stages=.nan", "--set", "worker.host=a"], "--set worker.host: no stage 'worker'"),
+        (["check", *GRAPH, 'worker.seconds="\\ud800"'], "--set worker.seconds: Expected `float`, got "),
+        (["check", *GRAPH, "migrations=..:x"], "--set migrations: no module '..'"),
+        (["check", *GRAPH, "migrations=:x"], "--set migrations: no module ''"),
     ],
 )
 def test_it_is_said_in_one_line(typed: list[str], said: str, capsys: pytest.CaptureFixture[str]):

@@ -88,6 +88,15 @@ class Quitter(Stage):
         return Double(value=2 * number.value)
 
 
+class NamesAFile(Stage):
+    """Speaks of a file whose name is not UTF-8."""
+
+    def on_number(self, number: Number, ctx: Context) -> Double:
+        name = os.fsdecode(b"d\xffd.png")
+        ctx.log(f"no {name} here")
+        raise Refused(f"no {name}")
+
+
 class DiesWithAnother(Stage):
     """Dies of the first death that it hears of."""
 

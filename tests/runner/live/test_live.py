@@ -238,6 +238,12 @@ def sum_of(progress: Progress) -> int:
             {"amout": "1"},
             "account add: no field 'amout'; did you mean 'amount'",
         ),
+        (
+            "account",
+            "add",
+            {"amount": "2026-13-45"},
+            "account add: amount=2026-13-45: Expected `int`, got `str`; valid",
+        ),
         ("account", "add", {"amount": "much"}, "account add: amount=much: Expected `int`, got `str`; valid: int"),
         (
             "account",

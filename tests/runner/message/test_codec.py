@@ -299,6 +299,11 @@ def test_a_record_over_the_limit_is_refused_where_it_is_published(monkeypatch: p
         codec.pack(LogLine("camera", 0, "info", "x" * 100, 0))
 
 
+def test_what_utf_8_cannot_hold_is_spelled_out_in_a_record():
+    line = LogLine("camera", 0, "info", "no d\udcffd.png", 0)
+    assert codec.unpack(LogLine, codec.pack(line)).text == r"no d\udcffd.png"
+
+
 def test_decoded_arrays_are_read_only():
     assert not codec.decode(Sample, codec.encode(sample())).image.flags.writeable
 

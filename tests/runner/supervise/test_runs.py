@@ -3,6 +3,8 @@
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from runner.recording.recording import Recording
 from runner.replay.replay import verify
 from runner.testing import read_until
 from runner.transport.bus import Bus
-from tests.runner.common.runs import DOUBLES, TOYS, Run, finish, meeting_of, processes_of, run, start
+from tests.runner.common.runs import DOUBLES, TOYS, Run, changed, finish, meeting_of, processes_of, run, start
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +85,25 @@ def test_a_refusal_ends_the_graph_with_one_line(tmp_path: Path):
     assert refused.code == 2
     assert refused.output.splitlines()[-1] == "doubler: number 1: valid: anything else"
     assert "Traceback" not in refused.output
+
+
+def test_a_file_whose_name_is_no_text_can_be_named(tmp_path: Path):
+    refused = run(changed(DOUBLES, tmp_path, Doubler="NamesAFile"), tmp_path)
+    assert refused.code == 2
+    assert re.search(r"doubler +no d\\udcffd.png here", refused.output), refused.output
+    assert refused.output.splitlines()[-1] == r"doubler: no d\udcffd.png"
+    assert "Traceback" not in refused.output
+    recording = Recording(refused.recording)
+    assert recording.verdict.complete
+    assert r"Refused: no d\udcffd.png" in [step.error for step in recording.steps]
+
+
+def test_a_run_whose_standard_streams_are_closed_says_nothing_and_works(tmp_path: Path):
+    up = ["up", str(DOUBLES), "--recordings", str(tmp_path), "--set", f"sink.path={tmp_path / 'out.txt'}"]
+    command = ["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', sys.executable, "-m", "runner.cli", *up]
+    assert subprocess.run(command, timeout=60, check=False).returncode == 0
+    (path,) = tmp_path.glob("*.mcap")
+    assert Recording(path).verdict.complete
 
 
 def test_a_stage_that_cannot_start_is_named(tmp_path: Path):
