@@ -348,8 +348,8 @@ class StageProcess:
     def _journal_end(self) -> None:
         """Says what has come and is left. At the end of the graph that is known once nobody publishes any more."""
         left: Iterable[tuple[str, str]] = ()
+        self._bus.publish(f"e/{self._process.path}", b"")
         if not self._retiring.is_set():
-            self._bus.publish(f"e/{self._process.path}", b"")
             self._presence.wait_for_the_end({edge.stage for edge in self._node.inputs.values()}, self._task.processes)
             self._intake.take(wait=False)
             self._say_what_is_left()

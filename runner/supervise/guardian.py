@@ -182,11 +182,12 @@ class Guardian:
 
     def _report_lost(self, child: Child) -> None:
         """Says that a process has ended otherwise than in order; where it has, the recorder has its own word, or lacks
-        it, and then the recording is not complete."""
-        code = child.handle.poll()
+        it, and then the recording is not complete. One that was asked to restart leaves the rest to a successor, which
+        does not come any more."""
+        code, retires = child.handle.poll(), child.retires_by is not None
         in_order = code == 0 and not child.killed_because and child.process in self._ready
-        if code is not None and not (child.reported or in_order or child.process in self._ended):
-            self._lose(child, child.reason(self.pulses.newest(child.process)))
+        if code is not None and (retires or not (in_order or child.process in self._ended)) and not child.reported:
+            self._lose(child, ASKED if retires and in_order else child.reason(self.pulses.newest(child.process)))
 
     def _lose(self, child: Child, reason: str) -> None:
         child.reported = True

@@ -9,7 +9,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from types import FrameType
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import psutil
@@ -95,6 +96,32 @@ class NamesAFile(Stage):
         name = os.fsdecode(b"d\xffd.png")
         ctx.log(f"no {name} here")
         raise Refused(f"no {name}")
+
+
+class Patient(Stage):
+    """Doubles numbers; its first step lasts until it was asked to restart and then, with all others, to end."""
+
+    Config = Mortality
+
+    def __init__(self, config: Mortality):
+        self._config = config
+
+    def on_number(self, number: Number) -> Double:
+        known, came = dict[int, Any](), set[int]()
+
+        def note(signum: int, frame: FrameType | None) -> None:
+            known[signum](signum, frame)
+            came.add(signum)
+
+        if first_time(self._config.marks / "begun"):
+            known |= {signum: signal.signal(signum, note) for signum in (signal.SIGUSR1, signal.SIGTERM)}
+            (self._config.marks / "waits").touch()
+            while signal.SIGUSR1 not in came:
+                time.sleep(0.01)
+            (self._config.marks / "asked").touch()
+            while signal.SIGTERM not in came:
+                time.sleep(0.01)
+        return Double(value=2 * number.value)
 
 
 class DiesWithAnother(Stage):
