@@ -138,8 +138,14 @@ class StageProcess:
         if self._presence.wait_for(expected, self._stopping.is_set):
             while self._intake.is_behind and not self._stopping.is_set():
                 time.sleep(CATCH_UP_SECONDS)
-            self._start()
-            self._serve()
+            if not self.is_behind:
+                self._start()
+                self._serve()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether it has not been told yet all that its predecessor has left: it cannot even say that this is left."""
+        return self._intake.is_behind
 
     def stop(self) -> None:
         """Ends :meth:`run` after the present step. May be called from a signal handler."""
@@ -467,6 +473,9 @@ def main() -> int:
         signal.signal(signal.SIGTERM, lambda *_: process.stop())
         signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
+        if process.is_behind:
+            code = EXIT_FAILED
+            last_words("ended before it knew what its predecessor had left")
     except Refused as refusal:
         code = EXIT_REFUSED
         last_words(str(refusal))

@@ -303,6 +303,21 @@ def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
 # ------------------------------------------------------------------------------------ shutdown
 
 
+def test_a_graph_that_ends_before_a_successor_knows_what_is_left_lacks_nothing(tmp_path: Path):
+    """It is to hear that once its publisher sends to it, which stands still."""
+    process = start(DOUBLES, tmp_path, *ENDLESS, "doubler.seconds=0.1")
+    before = read_until(process, "processes are ready")
+    wait_until((tmp_path / "out.txt").exists)
+    os.kill(pid_of(tmp_path, "counter-0"), signal.SIGSTOP)
+    os.kill(pid_of(tmp_path, "doubler-0"), signal.SIGKILL)
+    before += read_until(process, "ready after")
+    os.kill(process.pid, signal.SIGINT)
+    ended = finish(process, tmp_path, before)
+    recording = Recording(ended.recording)
+    assert (ended.code, recording.verdict.complete) == (130, True), recording.verdict
+    assert processes_of(tmp_path) == []
+
+
 def test_a_dying_terminal_ends_the_graph_in_order(tmp_path: Path):
     master, slave = pty.openpty()
     command = [sys.executable, "-m", "runner.cli", "up", str(DOUBLES), "--verbose", "--recordings", str(tmp_path)]
