@@ -23,7 +23,12 @@ from runner.process.forks import Forked, Threads, fork, refuse_threads
 
 PREPARE_SECONDS = 180.0
 """How long the fork server may prepare a process."""
+POLL_SECONDS = 0.05
 _PR_SET_CHILD_SUBREAPER = 36
+
+
+class Interrupted(Exception):
+    """The graph ends before a process is started."""
 
 
 class _Order(msgspec.Struct, frozen=True):
@@ -64,11 +69,25 @@ class ForkServer:
             self._give_up(str(reason))
         theirs.close()
 
-    def start(self, module: str, name: str, *, task: bytes, log: Path, mark: str = "") -> Handle:
-        """Starts what :func:`spawn` would; ``name`` is shown with the module in lists of processes."""
+    def start(
+        self,
+        module: str,
+        name: str,
+        *,
+        task: bytes,
+        log: Path,
+        mark: str = "",
+        stopping: Callable[[], bool] = lambda: False,
+    ) -> Handle:
+        """Starts what :func:`spawn` would; ``name`` is shown with the module in lists of processes.
+
+        ``stopping`` is asked first, and again and again while it is prepared: where that is true Interrupted is raised.
+        """
+        if stopping():
+            raise Interrupted(name)
         if self._server is not None:
             log.touch()
-            pid = self._ask(self._server, _Order(module, name, task, str(log), origin(mark)))
+            pid = self._ask(self._server, _Order(module, name, task, str(log), origin(mark)), stopping)
             if pid is not None:
                 return Forked(pid)
         return spawn(module, task=task, log=log, mark=mark)
@@ -79,22 +98,32 @@ class ForkServer:
         if self._server is not None:
             self._server.wait()
 
-    def _ask(self, server: Forked, order: _Order) -> int | None:
+    def _ask(self, server: Forked, order: _Order, stopping: Callable[[], bool]) -> int | None:
         """The id of a process that is there; None where there is no fork server any more."""
         try:
             with self._asking, _adopting():
                 self._connection.send_bytes(msgspec.msgpack.encode(order))
-                if self._connection.poll(PREPARE_SECONDS):
-                    answer = msgspec.msgpack.decode(self._connection.recv_bytes(), type=int | str)
-                else:
-                    answer = f"the fork server has not started {order.name} after {PREPARE_SECONDS:g} s"
+                answer = self._answer(order.name, stopping)
         except (EOFError, OSError):
             answer = f"the fork server {ending(server.wait())}"
+        except Interrupted:  # what it is at is of no use any more, and may take long
+            server.kill()
+            self._server = None
+            raise
         if isinstance(answer, int):
             return answer
         server.kill()
         self._give_up(answer)
         return None
+
+    def _answer(self, name: str, stopping: Callable[[], bool]) -> int | str:
+        deadline = time.monotonic() + PREPARE_SECONDS
+        while not self._connection.poll(POLL_SECONDS):
+            if stopping():
+                raise Interrupted(name)
+            if time.monotonic() > deadline:
+                return f"the fork server has not started {name} after {PREPARE_SECONDS:g} s"
+        return msgspec.msgpack.decode(self._connection.recv_bytes(), type=int | str)
 
     def _give_up(self, reason: str) -> None:
         self._server = None

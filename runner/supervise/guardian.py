@@ -67,9 +67,10 @@ class Guardian:
         say: Callable[[str, Level], None],
         announce: Callable[[Restarted], object],
         declare_lost: Callable[[Process, str], None],
+        stopping: Callable[[], bool],
     ):
         """``say`` tells people and the recording, ``announce`` tells the graph that a process is replaced, and
-        ``declare_lost`` everybody that it is dead."""
+        ``declare_lost`` everybody that it is dead. Once the graph is ``stopping`` no stage is started any more."""
         self._run = run
         self._graph = run.graph
         self._hosts = hosts
@@ -77,7 +78,7 @@ class Guardian:
         self._say = say
         self._announce = announce
         self._declare_lost = declare_lost
-        self._launch = Launcher(run, hosts, forks)
+        self._launch = Launcher(run, hosts, forks, stopping)
         self._children: dict[tuple[str, int], Child] = {}
         self._recorder: Child | None = None
         self._viewer: Child | None = None
@@ -114,7 +115,8 @@ class Guardian:
             self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
 
     def start_stages(self) -> None:
-        """Starts every process of the graph; raises Refused where one cannot be started."""
+        """Starts every process of the graph; raises Refused where one cannot be started, Interrupted where the graph ends
+        meanwhile."""
         for stage, replica in self._graph.processes():
             self._children[stage, replica] = self._start(Process(stage, replica))
 
@@ -154,6 +156,9 @@ class Guardian:
         children = list(self._children.values())
         for child in children:
             child.handle.signal_group(signal.SIGTERM)
+        for place in self._graph.processes():
+            if place not in self._children:
+                self._declare_lost(Process(*place), "the graph ended before it was started")
         deadline = time.monotonic() + STAGE_GRACE_SECONDS
         while time.monotonic() < deadline and any(map(self._publishes, children)):
             time.sleep(LOOK_SECONDS)

@@ -1,5 +1,6 @@
 """Starts the processes of a run, each with its task and where it belongs: the recorder, the viewer and the stages."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,11 +64,13 @@ class Run:
 class Launcher:
     """Starts single processes of one run, here or on the host that the graph names."""
 
-    def __init__(self, run: Run, hosts: Hosts | None, forks: ForkServer):
-        """``hosts`` are the other machines of the run, None where there are none."""
+    def __init__(self, run: Run, hosts: Hosts | None, forks: ForkServer, stopping: Callable[[], bool]):
+        """``hosts`` are the other machines of the run, None where there are none. Once the graph is ``stopping`` no
+        stage is started here any more."""
         self._run = run
         self._hosts = hosts
         self._forks = forks
+        self._stopping = stopping
         self.descendants = Descendants()
         """What stages and viewer start here."""
 
@@ -101,7 +104,7 @@ class Launcher:
         return Child(process, handle, log)
 
     def stage(self, process: Process, progress: Progress) -> Child:
-        """Starts a process of the graph; ``progress`` is how far its stage has come before."""
+        """Starts a process of the graph; ``progress`` is how far its stage has come before. Raises Interrupted."""
         run, task = self._run, self._assignment(process, progress)
         log = run.log_of(process)
         log_from = log.stat().st_size if log.exists() else 0
@@ -111,7 +114,9 @@ class Launcher:
         else:
             module, mark = "runner.process.stage_process", self.descendants.mark(process.path)
             data = msgspec.json.encode(task)
-            handle = self._forks.start(module, run.name_of(process), task=data, log=log, mark=mark)
+            handle = self._forks.start(
+                module, run.name_of(process), task=data, log=log, mark=mark, stopping=self._stopping
+            )
         return Child(process, handle, log, log_from=log_from, watch=Watch(run.graph.nodes[process.stage].limits))
 
     def _assignment(self, process: Process, progress: Progress) -> Assignment:

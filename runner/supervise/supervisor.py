@@ -27,7 +27,7 @@ from runner.message.codec import CodecError, Envelope, Journal, LogLine, Lost, O
 from runner.message.packet import GATEWAY, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.delivery import Delivery, Stopped
-from runner.process.fork_server import ForkServer
+from runner.process.fork_server import ForkServer, Interrupted
 from runner.process.stage_process import RECORDED_SECONDS
 from runner.supervise.calls import CallQuestion, CallRequest, Calls
 from runner.supervise.guardian import TICK_SECONDS, End, Guardian
@@ -97,6 +97,7 @@ class Supervisor:
             say=self._say,
             announce=partial(self._publish, port_name(Restarted)),
             declare_lost=self._declare_lost,
+            stopping=lambda: not self._events.empty(),
         )
         self._numbers: dict[str, int] = defaultdict(int)
         """Next sequence number by output port of the supervisor."""
@@ -121,7 +122,8 @@ class Supervisor:
             self._guardian.start_recorder(view=view)
             if self._hosts is not None:
                 self._hosts.open(self.id, self._run.recording)
-            self._guardian.start_stages()
+            with contextlib.suppress(Interrupted):
+                self._guardian.start_stages()
             end = self._watch()
         except Refused as refusal:  # a process that cannot be started
             end = End(EXIT_REFUSED, str(refusal))
@@ -139,8 +141,9 @@ class Supervisor:
                 end = self._events.get(timeout=TICK_SECONDS)
                 self._guardian.name_the_dead()
                 return end
-            if (end := self._guardian.look()) is not None:
-                return end
+            with contextlib.suppress(Interrupted):
+                if (end := self._guardian.look()) is not None:
+                    return end
 
     # ------------------------------------------------------------------------------------------ what is heard
 

@@ -248,6 +248,20 @@ class NeverReady(Stage):
         del number
 
 
+class Preparing(Stage):
+    """Prepares for longer than anybody waits."""
+
+    Config = Mortality
+
+    @classmethod
+    def prepare(cls, config: Mortality) -> None:
+        (config.marks / "prepares").touch()
+        time.sleep(100)
+
+    def on_number(self, number: Number) -> Double:
+        return Double(value=2 * number.value)
+
+
 class GatedCounter(Stage):
     """Counts like the toy counter; the last number waits for a file."""
 

@@ -20,7 +20,7 @@ from tests.runner.common.runs import TOYS
 def test_steps_may_be_noted_while_a_successor_is_told_of_those_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     graph = load_graph(TOYS, (f"sink.path={tmp_path / 'out.txt'}",))
     run = Run("toys-1", graph, tmp_path / "toys-1.mcap", (), "", "", None, steps_only=False)
-    launcher: Any = Launcher(run, None, cast("Any", SimpleNamespace(close=lambda: None)))
+    launcher: Any = Launcher(run, None, cast("Any", SimpleNamespace(close=lambda: None)), lambda: False)
     progress, numbers = Progress(), itertools.count()
 
     def note(*_: object) -> bool:

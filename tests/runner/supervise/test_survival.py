@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from runner.live.live import Live
 from runner.message.ids import MessageId
 from runner.process.children import DESCENT, Descendants
 from runner.process.forks import clean_environment
@@ -315,6 +316,23 @@ def test_a_graph_that_ends_before_a_successor_knows_what_is_left_lacks_nothing(t
     ended = finish(process, tmp_path, before)
     recording = Recording(ended.recording)
     assert (ended.code, recording.verdict.complete) == (130, True), recording.verdict
+    assert processes_of(tmp_path) == []
+
+
+def test_an_interrupt_is_heard_while_a_stage_prepares(tmp_path: Path):
+    process = start(changed(DOUBLES, tmp_path, Doubler="Preparing"), tmp_path, f"doubler.marks={tmp_path}")
+    wait_until((tmp_path / "prepares").exists)
+    with Live(next(entry for entry in runs() if Path(entry.recording).parent == tmp_path)) as live:
+        wait_until(lambda: live.status().processes[0].pulse)  # so that the recorder hears the end
+    (server,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[:1]
+    began = time.monotonic()
+    os.kill(process.pid, signal.SIGINT)
+    ended = finish(process, tmp_path)
+    assert time.monotonic() - began < 30, "it has waited for the stage"
+    recording = Recording(ended.recording)
+    assert (ended.code, ended.output.splitlines()[-1]) == (130, "interrupted")
+    assert recording.verdict.complete, recording.verdict
+    assert not lives(int(server))
     assert processes_of(tmp_path) == []
 
 
