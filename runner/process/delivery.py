@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 
 from runner.graph.graph import Route
@@ -33,6 +33,8 @@ class Outgoing:
         self.route = route
         self.unanswered: OrderedDict[str, str] = OrderedDict()
         """Messages that the consumer has not done with: lineage by id."""
+        self._lineages = Counter[str]()
+        """How many of them there are of each lineage."""
         self._awaited: dict[str, set[int]] = {}
         """Which replicas have not, by id; -1 where one of them is enough."""
         self._holders: dict[str, int] = {}
@@ -43,13 +45,14 @@ class Outgoing:
         """Whether one more message may be sent: a queue is counted in lineages, so that no join can starve."""
         if self.route.policy == "latest" or len(self.unanswered) < self.route.queue:
             return True
-        lineages = set(self.unanswered.values())
-        return lineage in lineages or len(lineages) < self.route.queue
+        return lineage in self._lineages or len(self._lineages) < self.route.queue
 
     def note(self, message_id: str, lineage: str) -> None:
         """Takes note of a message that is about to be sent."""
         if self.route.policy == "block":
+            self._uncount(message_id)
             self.unanswered[message_id] = lineage
+            self._lineages[lineage] += 1
             # What is kept for parts is put aside late by a replica that gets none of them, and their queue holds back.
             self._awaited[message_id] = {-1} if self.route.kept else set(self.route.takers)
 
@@ -58,9 +61,17 @@ class Outgoing:
         awaited = self._awaited.get(message_id, set())
         awaited -= {replica, -1}
         if not awaited:
+            self._uncount(message_id)
             self.unanswered.pop(message_id, None)
             self._awaited.pop(message_id, None)
             self._holders.pop(message_id, None)
+
+    def _uncount(self, message_id: str) -> None:
+        lineage = self.unanswered.get(message_id)
+        if lineage is not None:
+            self._lineages[lineage] -= 1
+            if not self._lineages[lineage]:
+                del self._lineages[lineage]
 
     def appeared(self, replica: int) -> None:
         """Takes note of a new process of the consumer, which holds nothing yet."""
