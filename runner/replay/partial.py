@@ -75,7 +75,7 @@ def _answer(node: Node, executor: Executor, request: Request) -> Answer:
     try:
         arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
         emitted += itertools.islice(executor.run(handler, arrivals, request.time_ns), request.most)
-    except Exception as problem:
+    except BaseException as problem:  # as in a run, where also who calls sys.exit() has failed
         error = f"{type(problem).__name__}: {problem}"
     return Answer(tuple(emitted), error)
 

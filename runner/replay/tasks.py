@@ -168,7 +168,9 @@ class Reexecution:
             began = time.process_time()
             try:
                 sealed = next(emissions, None)
-            except Exception as error:
+            except BaseException as error:  # as in a run, where also who calls sys.exit() has failed
+                if isinstance(error, KeyboardInterrupt) and not step.error.startswith("KeyboardInterrupt"):
+                    raise  # of who sits at the terminal
                 done.error = f"{type(error).__name__}: {error}"
                 return
             finally:

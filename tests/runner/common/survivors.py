@@ -74,17 +74,18 @@ class Mortality:
 
 
 class Quitter(Stage):
-    """Doubles numbers; the first process to see a two leaves as a script would."""
+    """Doubles numbers; the first process to see a two, or each, leaves as a script would."""
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Config:
         way: Literal["quit", "interrupt"] = "quit"
+        each: bool = False
 
     def __init__(self, config: Config):
         self._config = config
 
     def on_number(self, number: Number, ctx: Context) -> Double:
-        if number.value == 2 and first_time(ctx.directory / "left"):
+        if number.value == 2 and (self._config.each or first_time(ctx.directory / "left")):
             raise SystemExit(2) if self._config.way == "quit" else KeyboardInterrupt(2)
         return Double(value=2 * number.value)
 

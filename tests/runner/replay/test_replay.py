@@ -11,9 +11,9 @@ from runner.graph.reading import load_graph
 from runner.message.codec import Envelope, Lost, Step, decode, envelope, pack, unpack
 from runner.recording.recording import Recording
 from runner.replay.replay import change
-from runner.replay.tasks import Comparison, Execution
+from runner.replay.tasks import Comparison, Execution, Reexecution
 from tests.runner.common.recordings import ToyRun, record, record_toys, rewrite
-from tests.runner.common.toys import Answer
+from tests.runner.common.toys import Answer, Gatherer
 
 TABLE = "tolerances=tests.runner.common.toys:TOLERANCES"
 HEADER = {"id": "a.b#0", "lineage": "a.b#0", "time_ns": 0, "causes": ()}
@@ -163,6 +163,20 @@ def test_an_error_is_the_same_where_all_of_it_is(toys: Path, recorded: str, dive
     step = Step("gatherer", 0, 0, 0, "on_answers", (), (), 0, 0, 0, 0, "failed", recorded)
     comparison.add(Execution(step, error="ValueError: limit 1"))
     assert comparison.result.diverged == diverged
+
+
+def test_who_interrupts_a_handler_at_the_terminal_ends_the_replay(
+    toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(*_: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    recording = Recording(toys)
+    step = next(step for step in recording.steps if step.stage == "gatherer")
+    again = Reexecution(recording, change(recording).nodes["gatherer"], [step], seed=0, directory=tmp_path)
+    monkeypatch.setattr(Gatherer, "on_answers", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        again.execute(step)
 
 
 @pytest.mark.parametrize(("journalled", "said_so"), [(4, "44 of 45 messages of 3"), (0, "40 of 45 messages of 3")])

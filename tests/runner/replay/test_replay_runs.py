@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.runner.replays import busy, replay_once
-from tests.runner.common.runs import TOYS, Run, run
+from tests.runner.common.runs import DOUBLES, TOYS, Run, changed, run
 from tests.runner.replay.test_replay import replay, verify
 
 
@@ -40,6 +40,16 @@ def test_without_replicas_and_under_load_it_replays_to_the_byte(alone: Run):
         code, said = verify(survivor(alone), workers=3)
     assert code == 0, said
     assert "IDENTICAL: 45 messages" in said
+
+
+@pytest.mark.parametrize("way", ["quit", "interrupt"])
+def test_a_handler_that_leaves_the_process_leaves_it_again(tmp_path: Path, way: str):
+    graph = changed(DOUBLES, tmp_path, Doubler="Quitter")
+    left = run(graph, tmp_path, f"doubler.way={way}", "doubler.each=true", "doubler.restarts=1")
+    assert left.code == 1, left.output
+    code, said = verify(left.recording)
+    assert code == 0, said
+    assert "IDENTICAL: 2 messages of 1 stages" in said
 
 
 def test_another_number_of_replicas_changes_nothing(killed: Run):

@@ -167,6 +167,13 @@ class Mute(Gatherer):
         return super().on_answers(answers, number)
 
 
+class Quitting(Gatherer):
+    """Leaves on the third number, as a script would."""
+
+    def on_answers(self, answers: list[Answer], number: Number) -> Total | None:
+        return sys.exit("no third total") if number.value == 2 else super().on_answers(answers, number)
+
+
 class Leaving(Gatherer):
     """Its process goes while others work."""
 
@@ -391,10 +398,11 @@ def test_messages_of_another_class_have_changed(tmp_path: Path):
     assert "differ from the recording" in said
 
 
-def test_what_a_handler_raises_is_named_and_its_message_vanishes(toys: Path):
-    code, said = replay(toys, "--swap", "gatherer=tests.runner.replay.test_whatif:Mute")
+@pytest.mark.parametrize(("stage", "error"), [("Mute", "ValueError"), ("Quitting", "SystemExit")])
+def test_what_a_handler_raises_is_named_and_its_message_vanishes(toys: Path, stage: str, error: str):
+    code, said = replay(toys, "--swap", f"gatherer=tests.runner.replay.test_whatif:{stage}")
     assert code == 1
-    assert "FAILED gatherer.on_answers of counter.number#2: ValueError: no third total" in said
+    assert f"FAILED gatherer.on_answers of counter.number#2: {error}: no third total" in said
     assert "vanished: gatherer.total#4" in said
 
 
