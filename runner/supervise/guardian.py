@@ -115,7 +115,7 @@ class Guardian:
             self._terminal.show(SUPERVISOR, f"the viewer opens; without a display its address is in {self._viewer.log}")
 
     def start_stages(self) -> None:
-        """Starts every process; raises Refused where one cannot be started, Interrupted where the graph ends meanwhile."""
+        """Starts every process; raises Refused where one cannot be, Interrupted where the graph ends meanwhile."""
         for stage, replica in self._graph.processes():
             self._children[stage, replica] = self._start(Process(stage, replica))
 
