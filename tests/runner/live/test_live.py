@@ -34,7 +34,6 @@ from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
 from runner.supervise.registry import Entry, Registration, find_run, runs
 from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
-from runner.transport.presence import END_SECONDS
 from runner.transport.session import new_endpoint, runtime_folder
 from tests.runner.common.recordings import record_toys
 from tests.runner.common.runs import ACCOUNT, DOUBLES, TOYS, changed, finish, processes_of
@@ -381,7 +380,6 @@ def test_a_graph_that_ends_while_a_process_finishes_its_step_to_restart_lacks_no
         wait_until((tmp_path / "waits").exists)
         restarted = pool.submit(live.restart, "doubler")
         wait_until((tmp_path / "asked").exists)
-        began = time.monotonic()
         os.kill(run.process.pid, signal.SIGINT)
         finished = run.finish()
         with pytest.raises(Refused, match=r"^the graph ended before doubler was back"):
@@ -389,7 +387,6 @@ def test_a_graph_that_ends_while_a_process_finishes_its_step_to_restart_lacks_no
     recording = Recording(finished.recording)
     assert (finished.code, recording.verdict.complete) == (130, True), recording.verdict
     assert {step.outcome for step in recording.steps if step.stage == "doubler"} == {"stopped"}
-    assert time.monotonic() - began < END_SECONDS  # for which whoever hears nothing of it would wait
 
 
 def test_a_stage_that_would_forget_is_not_restarted(tmp_path: Path) -> None:
