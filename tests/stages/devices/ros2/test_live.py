@@ -24,7 +24,7 @@ from tests.stages.devices.ros2.lab import free_port, node, open_router, router
 K = np.array([[50.0, 0, 15.5], [0, 50.0, 11.5], [0, 0, 1]])
 RGB = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 MILLIMETRES = np.random.default_rng(1).integers(400, 2000, (24, 32)).astype(np.uint16)
-SHORT = Patience(warn=0.3, give_up=0.2, settle=0.1)
+SHORT = Patience(warn=0.3, give_up=2.0, settle=0.1)
 LONG = Patience(warn=0.3, give_up=30.0, settle=0.1)
 COMPRESSED = Source(color=f"{SOURCE.color}/compressed", depth=f"{SOURCE.depth}/compressedDepth")
 
