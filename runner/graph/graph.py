@@ -133,7 +133,7 @@ class Node:
     def prepare(self) -> None:
         """Has the stage fill caches that processes share which are forked from this one; says nothing of failures:
         they are those of :meth:`construct`."""
-        with contextlib.suppress(Exception):
+        with contextlib.suppress(Exception, SystemExit):
             self.type.cls.prepare(self.config)
 
     def construct(self) -> Stage:

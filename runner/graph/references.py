@@ -77,6 +77,8 @@ def _module(name: str, place: str) -> Any:
         raise Refused(f"{place}: no module {name!r}{_elsewhere(name)}") from None
     except ImportError as error:
         raise Refused(f"{place}: {name} cannot be imported: {error}") from None
+    except SystemExit as end:  # a script without a guard
+        raise Refused(f"{place}: {name} cannot be imported: it calls sys.exit({end.code!r})") from None
 
 
 @cache

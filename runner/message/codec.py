@@ -423,8 +423,14 @@ def pack(record: Envelope | Step | Journal | CaughtUp | Deal | Lost | LogLine | 
 
 def _spelled_out(record: R) -> R:
     values = ((name, getattr(record, name)) for name in record.__struct_fields__)
-    texts = {name: text.encode(errors="backslashreplace").decode() for name, text in values if isinstance(text, str)}
-    return msgspec.structs.replace(record, **texts)
+    return msgspec.structs.replace(
+        record, **{name: spelled_out(text) for name, text in values if isinstance(text, str)}
+    )
+
+
+def spelled_out(text: str) -> str:
+    """What a record holds of a text: characters that UTF-8 cannot hold as the codes that they have in Python."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def unpack(kind: type[R], payload: bytes | memoryview | msgspec.Raw) -> R:

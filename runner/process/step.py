@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -18,6 +18,9 @@ from runner.message.ids import MessageId
 
 Log = Callable[[str, Level], object]
 """Takes one line of a stage's log."""
+
+
+LEVELS = get_args(Level)
 
 
 class BrokenContract(Exception):
@@ -58,7 +61,11 @@ class StepContext:
         return np.random.default_rng(self._seed())
 
     def log(self, text: str, *, level: Level = "info") -> None:
-        """Shows and records one line."""
+        """Shows and records one line; raises BrokenContract where it is none."""
+        if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance] - of whoever runs no type checker
+            raise BrokenContract(f"logged a {type(text).__name__}; valid: a text")
+        if level not in LEVELS:
+            raise BrokenContract(f"logged at level {level!r}; valid: {', '.join(LEVELS)}")
         self._log(text, level)
 
 

@@ -20,11 +20,13 @@ import msgspec
 
 from runner.contract import Part, Refused
 from runner.graph.graph import Edge, Graph, Node
-from runner.message.codec import CodecError, Envelope, Step, decode_untyped
+from runner.message.codec import CodecError, Envelope, Step, decode_untyped, spelled_out
 from runner.message.ids import MessageId
+from runner.message.packet import Process
 from runner.process.inbox import Inbox, Mismatched, Ready
 from runner.process.step import Arrival, Executor, receive, step_time
 from runner.recording.recording import Recording, replicated
+from runner.replay.tasks import failed_so
 from runner.replay.workers import Worker
 
 AHEAD = 16
@@ -76,7 +78,7 @@ def _answer(node: Node, executor: Executor, request: Request) -> Answer:
         arrivals = [receive(node.type.inputs[port], sealed) for port, sealed in request.inputs]
         emitted += itertools.islice(executor.run(handler, arrivals, request.time_ns), request.most)
     except BaseException as problem:  # as in a run, where also who calls sys.exit() has failed
-        error = f"{type(problem).__name__}: {problem}"
+        error = spelled_out(f"{type(problem).__name__}: {problem}")
     return Answer(tuple(emitted), error)
 
 
@@ -123,8 +125,18 @@ class _Stage:
 class PartialReplay:
     """The executed part of a graph, between what is recorded and what is compared."""
 
-    def __init__(self, recording: Recording, graph: Graph, names: Collection[str], *, workers: int, folder: Path):
-        """Starts the processes of all ``names``; raises Refused where a stage cannot be constructed."""
+    def __init__(
+        self,
+        recording: Recording,
+        graph: Graph,
+        names: Collection[str],
+        *,
+        changed: Collection[str],
+        workers: int,
+        folder: Path,
+    ):
+        """Starts the processes of all ``names``, of which those ``changed`` are not as recorded; raises Refused where a
+        stage cannot be constructed."""
         self.emitted: dict[str, Envelope] = {}
         """By id, in the order of emission."""
         self.errors: list[str] = []
@@ -132,12 +144,18 @@ class PartialReplay:
         self._graph = graph
         self._workers = workers
         self._unordered = _unordered(recording, graph)
-        self._journal = _journal(recording, self._unordered)
+        lost = {name: processes for name, processes in _lost(recording).items() if name not in changed}
+        """Those that were changed may go on where they failed."""
+        self._journal = _journal(recording, self._unordered, {one for each in lost.values() for one in each})
         self._ranks = {key: rank for rank, key in enumerate(self._journal)}
-        self._consumed = {(step.stage, port, id) for step in recording.steps for port, id in step.consumed}
-        self._left = {(end.stage, port, id) for end in recording.ends for port, id in end.left} - self._consumed
-        """What had come when the graph ended, and no step had taken."""
-        self.frozen = Frozen(recording, names)
+        self._consumed = {(step.stage, port, id) for step in self._journal.values() for port, id in step.consumed}
+        left = {(end.stage, port, id) for end in recording.ends for port, id in end.left}
+        self._left = (left | _arrived(recording, graph, lost)) - self._consumed
+        """What had come when the graph ended, or the stage was lost, and no step had taken."""
+        emitted = {id for step in recording.steps for id in step.emitted}
+        self.unexplained = {id for id in recording.messages if MessageId.of(id).stage in lost} - emitted
+        """What a process sent that was killed in the midst of a step."""
+        self.frozen = Frozen(recording, names, self.unexplained)
         self._ahead = 0
         self._running: dict[Connection, tuple[_Stage, Key, Worker]] = {}
         self._processes: list[Worker] = []
@@ -233,7 +251,7 @@ class PartialReplay:
         self._ahead = 0
         stage.idle.append(child)
         step = self._journal.get(key)
-        if answer.error and (step is None or answer.error != step.error):  # else a command that was refused then, too
+        if answer.error and (step is None or not failed_so(step, answer.error)):
             self.errors.append(f"{name}: {answer.error}")
         for sealed in answer.emitted:
             self.emitted[sealed.id] = sealed
@@ -286,12 +304,13 @@ def _answer_of(child: Worker, what: str) -> Answer:
 class Frozen:
     """The messages that stay as recorded: each comes once all that it answers has come."""
 
-    def __init__(self, recording: Recording, names: Collection[str]) -> None:
+    def __init__(self, recording: Recording, names: Collection[str], others: Collection[str]) -> None:
+        """Those of all stages but ``names``, and ``others`` by their ids."""
         self.came: set[str] = set()
         """Ids of all that has come, recorded or new."""
         self._recording = recording
         self._positions = {id: position for position, id in enumerate(recording.messages)}
-        frozen = (id for id in recording.messages if MessageId.of(id).stage not in names)
+        frozen = (id for id in recording.messages if id in others or MessageId.of(id).stage not in names)
         self._free = [(self._positions[id], id) for id in frozen]
         """A heap: what may come, oldest first."""
         self._waiting: dict[str, list[str]] = defaultdict(list)
@@ -320,6 +339,28 @@ class Frozen:
         return sorted((id for ids in self._waiting.values() for id in ids), key=self._positions.__getitem__)
 
 
+def _lost(recording: Recording) -> dict[str, set[Process]]:
+    """By stage, its last processes that were lost: they say not what they left."""
+    newest: dict[tuple[str, int], int] = {}
+    for one in (*recording.steps, *recording.ends, *recording.lost):
+        newest[one.process.place] = max(one.incarnation, newest.get(one.process.place, 0))
+    lost = defaultdict[str, set[Process]](set)
+    for one in recording.lost:
+        if one.incarnation == newest[one.process.place]:
+            lost[one.stage].add(one.process)
+    return lost
+
+
+def _arrived(recording: Recording, graph: Graph, names: Collection[str]) -> set[tuple[str, str, str]]:
+    """(stage, port, id) of all that there was for some stages."""
+    return {
+        (route.consumer, route.input, id)
+        for id in recording.messages
+        for route in graph.routes(MessageId.of(id).stage)
+        if route.consumer in names and route.output == MessageId.of(id).port
+    }
+
+
 def _unordered(recording: Recording, graph: Graph) -> dict[tuple[str, str], str]:
     """The ports that drive steps which come in any order, by stage and handler: what replicas emit, one at a time."""
     replicas = replicated(recording.graph) | {name for name, node in graph.nodes.items() if node.replicated}
@@ -337,9 +378,16 @@ def _sequence(consumed: Iterable[tuple[str, str]], port: str | None) -> int | No
     return next((MessageId.of(id).sequence for name, id in consumed if name == port), None)
 
 
-def _journal(recording: Recording, unordered: Mapping[tuple[str, str], str]) -> dict[Key, Step]:
-    """Every step that was done, or stopped at the end of the graph, in their order."""
-    taken = [step for step in recording.steps if step.outcome in ("done", "stopped") and step.handler != "source"]
+def _journal(
+    recording: Recording, unordered: Mapping[tuple[str, str], str], lost: Collection[Process]
+) -> dict[Key, Step]:
+    """Every step that was done, or stopped at the end of the graph, in their order; and those by which processes failed
+    that are ``lost``, for no successor took them again."""
+    taken = [
+        step
+        for step in recording.steps
+        if step.handler != "source" and (step.outcome in ("done", "stopped") or step.process in lost)
+    ]
     taken.sort(key=lambda step: step.incarnation)  # stable: within a process the journal has them in order
     counts: Counter[tuple[str, str, str]] = Counter()
     journal: dict[Key, Step] = {}

@@ -10,7 +10,8 @@ import json
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -31,7 +32,7 @@ from runner.message.ids import MessageId
 from runner.recording.recording import Recording, replicated
 from runner.replay.tasks import Comparison, Reexecution, Result, Task, steps_of
 from runner.replay.tolerances import compare_origin
-from runner.replay.workers import run_each
+from runner.replay.workers import Job, run_each
 from runner.terminal import listed
 
 
@@ -107,7 +108,7 @@ def _results(
     """
     with tempfile.TemporaryDirectory() as folder:
 
-        def jobs() -> Iterator[tuple[Task, Callable[[], bytes]]]:
+        def jobs() -> Iterator[tuple[Task, Job]]:
             for stage in _by_cost(recording):
                 node = node_from_entry(stage, graph["stages"][stage])
                 if not node.type.cls.device:
@@ -122,22 +123,26 @@ def _results(
             yield task, Result(failure=answer) if failed else msgspec.json.decode(answer, type=Result)
 
 
-def _execute(recording: Recording, node: Node, task: Task, *, seed: int, tolerances: Tolerances, folder: str) -> bytes:
-    """Executes one task; runs in the task's own process."""
+@contextmanager
+def _execute(
+    recording: Recording, node: Node, task: Task, *, seed: int, tolerances: Tolerances, folder: str
+) -> Generator[bytes]:
+    """Executes one task; runs in the task's own process. The stage is closed once its result has been taken."""
     began = time.process_time()
     steps, files = steps_of(recording, task, node), Path(tempfile.mkdtemp(dir=folder))
     comparison = Comparison(recording, node, tolerances)
-    try:
-        again = Reexecution(recording, node, steps, seed=seed, directory=files)
-        comparison.result.startup = time.process_time() - began
-        for step in steps:
-            comparison.add(again.execute(step))
-        again.stage.close()
-        comparison.result.seconds = again.seconds
-        comparison.result.changes = tuple(comparison.summary.changes)
-    except Refused as refusal:
-        return msgspec.json.encode(Result(failure=str(refusal)))
-    return msgspec.json.encode(comparison.result)
+    result = comparison.result
+    with ExitStack() as stack:
+        try:
+            again = Reexecution(recording, node, steps, seed=seed, directory=files)
+            stack.callback(again.stage.close)
+            result.startup = time.process_time() - began
+            for step in steps:
+                comparison.add(again.execute(step))
+            result.seconds, result.changes = again.seconds, tuple(comparison.summary.changes)
+        except Refused as refusal:
+            result = Result(failure=str(refusal))
+        yield msgspec.json.encode(result)
 
 
 def _cost(recording: Recording, results: Mapping[Task, Result], wall: float) -> str:

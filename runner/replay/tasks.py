@@ -17,7 +17,7 @@ from runner.graph.graph import Node
 from runner.graph.ports import Handler
 from runner.inspect.compare import envelope_differences
 from runner.inspect.summary import FieldChange, Summary
-from runner.message.codec import CodecError, Envelope, Step, pack
+from runner.message.codec import CodecError, Envelope, Step, pack, spelled_out
 from runner.message.ids import MessageId
 from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.migrations import without_gained_fields
@@ -171,13 +171,18 @@ class Reexecution:
             except BaseException as error:  # as in a run, where also who calls sys.exit() has failed
                 if isinstance(error, KeyboardInterrupt) and not step.error.startswith("KeyboardInterrupt"):
                     raise  # of who sits at the terminal
-                done.error = f"{type(error).__name__}: {error}"
+                done.error = spelled_out(f"{type(error).__name__}: {error}")
                 return
             finally:
                 self.seconds += time.process_time() - began
             if sealed is None:
                 return
             yield sealed
+
+
+def failed_so(step: Step, error: str) -> bool:
+    """Whether a recorded step failed, or not, with this error; recorded it says where it was raised, too."""
+    return step.error == error or step.error.startswith(f"{error} (")
 
 
 class Comparison:
@@ -206,7 +211,7 @@ class Comparison:
                 self._diverge(step, id, "recorded, and not emitted in the replay")
             elif id in self._recording.messages:
                 self._compare(step, self._recording.envelope(id), sealed)
-        recorded_so = step.error == done.error or step.error.startswith(f"{done.error} (")  # with where it was raised
+        recorded_so = failed_so(step, done.error)
         if step.outcome != "stopped" and not recorded_so:
             text = f"recorded {step.error or 'no error'!r}, replayed {done.error or 'no error'!r}"
             self._diverge(step, "-", f"error: {text}")

@@ -69,7 +69,11 @@ def travel(
         return 1
     prompt = prompt or (sys.stdin.isatty() and sys.stdout.isatty())
     with tempfile.TemporaryDirectory() as folder:
-        Traveller(recording, graph, Path(folder)).go(start, step=step, prompt=prompt)
+        traveller = Traveller(recording, graph, Path(folder))
+        try:
+            traveller.go(start, step=step, prompt=prompt)
+        finally:
+            traveller.close()
     return 0
 
 
@@ -110,6 +114,12 @@ class Traveller:
         self._causes = Causes(recording)
         self._log: list[str] = []
         self._processes: dict[Process, tuple[Stage, Iterator[Execution]]] = {}
+
+    def close(self) -> None:
+        """Closes the stages that were constructed."""
+        for stage, _ in self._processes.values():
+            with suppress(Exception):  # and goes on with the others
+                stage.close()
 
     def go(self, start: str, *, step: bool, prompt: bool) -> None:
         """Shows a message, with ``step`` the ones after it too for as long as somebody presses Enter."""

@@ -45,13 +45,14 @@ def what_if(
     recording = Recording(path)
     recording.require_messages()
     graph = change(recording, assignments, swaps)
-    names = affected_by(graph, _changed(recording, graph) | _known(graph, origins, "--from"))
+    changed = _changed(recording, graph)
+    names = affected_by(graph, changed | _known(graph, origins, "--from"))
     _, changes = compare_origin(recording)
     frozen = ", ".join(name for name in graph.nodes if name not in names)
     what = f"executed again: {', '.join(names)}; as recorded: {frozen or 'nothing'}"
     print(*changes, f"{path}: {recording.verdict}", what, sep="\n")
     with tempfile.TemporaryDirectory() as folder:
-        replay = PartialReplay(recording, graph, names, workers=workers, folder=Path(folder))
+        replay = PartialReplay(recording, graph, names, changed=changed, workers=workers, folder=Path(folder))
         replay.run()
     for line in _verdict(recording, graph, names, replay):
         print(line)
@@ -100,13 +101,18 @@ def affected_by(graph: Graph, origins: Collection[str]) -> list[str]:
 
 
 def effects_of(
-    recording: Recording, graph: Graph, names: Collection[str], emitted: Mapping[str, Envelope]
+    recording: Recording,
+    graph: Graph,
+    names: Collection[str],
+    emitted: Mapping[str, Envelope],
+    unexplained: Collection[str],
 ) -> tuple[dict[Effect, list[str]], Summary]:
-    """Compares what was emitted with what is recorded of the same stages: ids by effect, and which fields differ."""
+    """Compares what was emitted with what is recorded of the same stages, but for what is ``unexplained``: ids by
+    effect, and which fields differ."""
     effects: dict[Effect, list[str]] = {effect: [] for effect in EFFECTS}
     summary = Summary()
     for id in recording.messages:
-        if MessageId.of(id).stage not in names:
+        if MessageId.of(id).stage not in names or id in unexplained:
             continue
         if id not in emitted:
             effects["vanished"].append(id)
@@ -122,7 +128,7 @@ def effects_of(
 
 
 def _verdict(recording: Recording, graph: Graph, names: Sequence[str], replay: PartialReplay) -> Iterator[str]:
-    effects, summary = effects_of(recording, graph, names, replay.emitted)
+    effects, summary = effects_of(recording, graph, names, replay.emitted, replay.unexplained)
     yield ""
     yield from _by_topic(effects)
     if effects["changed"]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
+from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -15,6 +17,8 @@ from runner.process.children import PARENT, die_with_parent, ending, last_lines
 from runner.process.forks import Forked, fork
 
 T = TypeVar("T")
+Job = Callable[[], AbstractContextManager[bytes]]
+"""Gives the answer, and cleans up after it has been sent."""
 
 STOP_SECONDS = 5.0
 
@@ -32,6 +36,8 @@ class Worker(Forked):
         def begin() -> None:
             self.connection.close()
             os.environ[PARENT] = str(parent)
+            for signum in (signal.SIGTERM, signal.SIGHUP):
+                signal.signal(signum, signal.SIG_DFL)
             die_with_parent()
             work(theirs)
 
@@ -52,9 +58,7 @@ class Worker(Forked):
         return ": ".join([f"its process {ending(self.wait())}", *last_lines(self.log, 1)])
 
 
-def run_each(
-    jobs: Iterable[tuple[T, Callable[[], bytes]]], *, workers: int, folder: Path
-) -> Iterator[tuple[T, bytes | str]]:
+def run_each(jobs: Iterable[tuple[T, Job]], *, workers: int, folder: Path) -> Iterator[tuple[T, bytes | str]]:
     """Does every job in a process of its own, ``workers`` at a time; yields each answer as it comes, or why there is
     none. Jobs are drawn one ahead, so that what a generator of them imports is imported while others work."""
     running: dict[Connection, tuple[T, Worker]] = {}
@@ -62,13 +66,18 @@ def run_each(
         for number, (item, work) in enumerate(jobs):
             while len(running) >= workers:
                 yield _collected(running)
-            child = Worker(lambda connection, work=work: connection.send_bytes(work()), folder / f"{number}.txt")
+            child = Worker(partial(_answer, work), folder / f"{number}.txt")
             running[child.connection] = (item, child)
         while running:
             yield _collected(running)
     finally:
         for _, child in running.values():
             child.kill()
+
+
+def _answer(work: Job, connection: Connection) -> None:
+    with work() as answer:
+        connection.send_bytes(answer)
 
 
 def _collected(running: dict[Connection, tuple[T, Worker]]) -> tuple[T, bytes | str]:

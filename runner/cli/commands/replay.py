@@ -2,6 +2,8 @@
 
 import argparse
 import os
+import signal
+import sys
 
 from runner.cli.commands import Commands, add, add_file, add_settings, count
 from runner.contract import Refused
@@ -59,6 +61,9 @@ def _replay(options: argparse.Namespace) -> int:
     from runner.process.forks import become_clean
 
     become_clean("runner.cli", *options.arguments)
+    for signum in (signal.SIGTERM, signal.SIGHUP):  # temporary folders go, too
+        if signal.getsignal(signum) != signal.SIG_IGN:  # which nohup has asked for
+            signal.signal(signum, lambda number, _: sys.exit(128 + number))
     execute = _travel if travels else _what_if if changes else _verify
     return execute(options)
 
