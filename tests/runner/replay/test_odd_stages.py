@@ -146,7 +146,8 @@ def test_a_replay_that_is_ended_leaves_nothing(
     path, temporary = recorded("Endless", tmp_path), tmp_path / "tmp"
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
-    command = (sys.executable, "-m", "runner.cli", "replay", str(path), *way)
+    heard = "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    command = (sys.executable, "-c", heard, sys.executable, "-m", "runner.cli", "replay", str(path), *way)
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         wait_until(lambda: any(log.read_text() for log in temporary.glob("*/*.txt")))
         process.send_signal(signum)
