@@ -138,13 +138,16 @@ def test_without_its_recorder_a_graph_ends(tmp_path: Path):
 def test_a_run_whose_folder_is_moved_ends_in_order(tmp_path: Path, killed: bool):
     folder, moved = tmp_path / "here", tmp_path / "there"
     folder.mkdir()
+    period = 2.0 if killed else 0.05  # what a process sends as it is killed may be lost
     process = start(
-        DOUBLES, folder, "counter.count=40", "counter.period=0.05", "sink.count=40", f"sink.path={os.devnull}"
+        DOUBLES, folder, "counter.count=40", f"counter.period={period}", "sink.count=40", f"sink.path={os.devnull}"
     )
     before = read_until(process, "processes are ready")
     doubler = pid_of(folder, "doubler-0")
     folder.rename(moved)
     if killed:
+        (recording,) = moved.glob("*.mcap")
+        wait_until(lambda: "doubler.double#0" in Recording(recording).messages)
         os.kill(doubler, signal.SIGKILL)
     ended = finish(process, moved, before)
     match = re.search(r"run (\S+) on unixsock-stream/(\S+)", before)
