@@ -105,8 +105,11 @@ class Intake:
             envelope = codec.unpack(Envelope, packet.payload)
             id = envelope.id
             source, number = numbered(id)
-            if number in self._arrived[name, source]:
+            arrived = self._arrived[name, source]
+            if number in arrived:
                 return
+            arrived.add(number)
+            arrived.keep(REMEMBERED)
             port = self._node.type.inputs.get(name)
             if port is None:
                 raise CodecError("key", "", f"no such input; valid: {', '.join(self._node.type.inputs)}")
@@ -116,11 +119,6 @@ class Intake:
             self._refusals.refuse(packet.key, error)
             if id:
                 self._left.append((name, id))
-        if id:
-            source, number = numbered(id)
-            arrived = self._arrived[name, source]
-            arrived.add(number)
-            arrived.keep(REMEMBERED)
 
     def take_left(self) -> tuple[tuple[str, str], ...]:
         """(port, id) of what was refused, or put aside without having been part of a step, since the last call."""

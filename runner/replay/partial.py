@@ -144,8 +144,8 @@ class PartialReplay:
         self._graph = graph
         self._workers = workers
         self._unordered = _unordered(recording, graph)
+        # A stage that was changed may go on where it failed.
         lost = {name: processes for name, processes in _lost(recording).items() if name not in changed}
-        """Those that were changed may go on where they failed."""
         self._journal = _journal(recording, self._unordered, {one for each in lost.values() for one in each})
         self._ranks = {key: rank for rank, key in enumerate(self._journal)}
         self._consumed = {(step.stage, port, id) for step in self._journal.values() for port, id in step.consumed}

@@ -72,10 +72,10 @@ class Swap(Drawn):
         shown = slots = np.arange(len(_SLOTS))
         if kind == "start":
             slots = np.roll(shown, -1 - self._draws[kind] // _ORDERED % (len(_SLOTS) - 1))
-        if kind == "start" and self._draws[kind] > _IN_CIRCLE:
-            slots = rng.permutation(shown)
-            if (slots == shown).any():
-                raise Rejected("an object where the goal has it")
+            if self._draws[kind] > _IN_CIRCLE:
+                slots = rng.permutation(shown)
+                if (slots == shown).any():
+                    raise Rejected("an object where the goal has it")
         for name, k in zip(self._parts, slots, strict=True):
             if not draft.put_at(name, "tray", (T @ [*_SLOTS[k], 0, 1])[:2], yaw):
                 raise Rejected("no room in sight")
