@@ -33,7 +33,7 @@ from runner.hosts.head import (
 )
 from runner.message.packet import Packet, Process
 from runner.process.children import Descendants, Handle, behind, end_process, last_lines
-from runner.process.fork_server import ForkServer
+from runner.process.fork_server import ForkServer, Interrupted
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import private
@@ -43,7 +43,7 @@ GRACE_SECONDS = 2.0
 TICK_SECONDS = 0.05
 TAIL_LINES = 40
 GONE = 1
-"""Exit status where the head has gone or cannot be reached."""
+"""Exit status where the head has gone or cannot be reached, and stands for that of a process that cannot be started."""
 
 
 @dataclass(slots=True)
@@ -68,6 +68,9 @@ class Agent:
         self._forks = forks
         self._session = secrets.randbits(24)
         self._events: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self._killed: set[Process] = set()
+        self._dismissed = False
+        """Both are heard at once, also while a process is being prepared."""
         self._head_is_there = False
         self._children: dict[Process, _Child] = {}
 
@@ -82,7 +85,7 @@ class Agent:
         endpoint = private(self._layout.endpoint)
         self._bus = Bus(control(name), endpoint, network=self._network, process=own)
         for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, lambda number, _: self._events.put(Dismiss(128 + number, "interrupted")))
+            signal.signal(signum, lambda number, _: self._hear(Dismiss(128 + number, "interrupted")))
         self._descendants = Descendants()
         try:
             return self._take_part()
@@ -92,9 +95,16 @@ class Agent:
 
     def _on_order(self, packet: Packet) -> None:
         try:
-            self._events.put(msgspec.json.decode(packet.payload, type=Order))
+            self._hear(msgspec.json.decode(packet.payload, type=Order))
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             self._say(f"an order is refused: {error}")
+
+    def _hear(self, order: Order) -> None:
+        """Takes an order, from any thread."""
+        self._dismissed |= isinstance(order, Dismiss)
+        if isinstance(order, Signal) and order.signum == signal.SIGKILL:
+            self._killed.add(order.process)
+        self._events.put(order)
 
     def _take_part(self) -> Dismiss:
         """Raises Refused with the head's reason where it does not take this host in."""
@@ -111,13 +121,16 @@ class Agent:
         run = _plain(self._bus.ask("join", msgspec.json.encode(hello), ASK_SECONDS).decode())
         self._say(f"takes part in run {run}")
         self._folder = (self._recordings / run).absolute()
-        (self._folder / "log").mkdir(parents=True, exist_ok=True)
+        try:
+            (self._folder / "log").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise Refused(f"{self._folder}: {error.strerror}") from None
         return self._serve()
 
     def _on_presence(self, process: Process, present: bool) -> None:
         if process.stage == self._network.head:
             if self._head_is_there and not present:
-                self._events.put(Dismiss(GONE, f"the connection to {process.stage} is gone; start this host again"))
+                self._hear(Dismiss(GONE, f"the connection to {process.stage} is gone; start this host again"))
             self._head_is_there = present
 
     # ------------------------------------------------------------------------------------------ processes
@@ -128,14 +141,20 @@ class Agent:
             self._reap()
             with contextlib.suppress(queue.Empty):
                 match self._events.get(timeout=TICK_SECONDS):
-                    case Start() as order:
-                        self._start(order)
+                    case Start(process) as order:
+                        try:
+                            self._start(order)
+                        except Interrupted:
+                            self._report(Ended(process, -signal.SIGKILL, ""))
+                        except OSError as error:
+                            self._report(Ended(process, GONE, f"it cannot be started: {error}\n"))
                     case Signal() as order:
                         self._signal(order)
                     case end:
                         return end
 
     def _start(self, order: Start) -> None:
+        """Raises OSError where it cannot be started and Interrupted where nobody wants it any more."""
         process = order.process
         _plain(process.stage)
         task = msgspec.structs.replace(
@@ -149,7 +168,11 @@ class Agent:
         log_from = log.stat().st_size if log.exists() else 0
         name, mark = f"{process.stage}.{process.replica}", self._descendants.mark(process.path)
         module, data = "runner.process.stage_process", msgspec.json.encode(task)
-        handle = self._forks.start(module, name, task=data, log=log, mark=mark)
+
+        def stopping() -> bool:
+            return self._dismissed or process in self._killed
+
+        handle = self._forks.start(module, name, task=data, log=log, mark=mark, stopping=stopping)
         self._children[process] = _Child(handle, log, log_from)
         self._say(f"starts {name}")
         self._report(Started(process, handle.pid))

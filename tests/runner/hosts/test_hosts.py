@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,9 +14,9 @@ from runner.cli.main import main
 from runner.contract import EXIT_REFUSED
 from runner.graph.document import read_document
 from runner.graph.placement import Host, read_layout
-from runner.hosts.head import Dismiss, Hello, RemoteChild, Start, control, network_of
+from runner.hosts.head import Dismiss, Ended, Hello, RemoteChild, Report, Start, control, network_of
 from runner.hosts.keys import make_keys
-from runner.message.packet import Process
+from runner.message.packet import Packet, Process
 from runner.process.stage_process import Assignment
 from runner.recording.recording import Recording
 from runner.testing import read_until
@@ -148,24 +149,28 @@ def test_a_host_with_another_graph_is_refused_with_the_difference(parties, tmp_p
     assert party.end("head").code == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("run", "stage"), [("../elsewhere", "worker"), ("toys-1", "../../elsewhere/worker")])
-def test_a_host_writes_nowhere_but_in_its_folder(parties, tmp_path: Path, run: str, stage: str):
-    """Whatever its head calls a run or a stage."""
-    (tmp_path / "worker1" / "elsewhere").mkdir(parents=True)
-    party: Party = parties(on_loopback(), tmp_path)
+def orders_to_worker1(party: Party, run: str, process: Process) -> tuple[str, list[Report]]:
+    """What it prints and reports to a head that has it start one process and, once that has ended, end itself."""
     document = read_document(HOSTS)
     document.values["hosts"] |= party.machines.addresses
     layout = read_layout(document)
     name, own = document.values["name"], Process("head", 0, 1)
     endpoint = private(layout.endpoint)
     head = Bus(control(name), endpoint, network=network_of(layout, "head"), process=own, listen=True)
+    reports: list[Report] = []
 
     def join(text: bytes) -> bytes:
-        hello = msgspec.json.decode(text, type=Hello)
-        task = Assignment(run, "", "", stage, {}, 0, (), ())
-        for order in (Start(Process(stage, 0), task), Dismiss(0, "the end")):
-            head.publish(f"order/worker1/{hello.session}", msgspec.json.encode(order))
+        session = msgspec.json.decode(text, type=Hello).session
+        order = f"order/worker1/{session}"
+
+        def heard(packet: Packet) -> None:
+            reports.append(msgspec.json.decode(packet.payload, type=Report))
+            if isinstance(reports[-1], Ended):
+                head.publish(order, msgspec.json.encode(Dismiss(0, "the end")))
+
+        head.subscribe(f"report/worker1/{session}", heard)
+        task = Assignment(run, "", "", process.stage, {}, 0, (), ())
+        head.publish(order, msgspec.json.encode(Start(process, task)))
         return run.encode()
 
     head.serve("join", join)
@@ -173,10 +178,55 @@ def test_a_host_writes_nowhere_but_in_its_folder(parties, tmp_path: Path, run: s
     party.start("worker1")
     output = party.hosts["worker1"].communicate(timeout=60)[0]
     head.close()
+    return output, reports
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("run", "stage"), [("../elsewhere", "worker"), ("toys-1", "../../elsewhere/worker")])
+def test_a_host_writes_nowhere_but_in_its_folder(parties, tmp_path: Path, run: str, stage: str):
+    """Whatever its head calls a run or a stage."""
+    (tmp_path / "worker1" / "elsewhere").mkdir(parents=True)
+    party: Party = parties(on_loopback(), tmp_path)
+    output = orders_to_worker1(party, run, Process(stage, 0))[0]
     wrong = stage if "/" in stage else run
     assert f"the head names {wrong!r}; valid: letters, digits, _ and -" in output
     assert party.hosts["worker1"].returncode == EXIT_REFUSED
     assert list(tmp_path.rglob("elsewhere/*")) == []
+
+
+@pytest.mark.slow
+def test_what_cannot_be_started_is_reported_with_the_reason(parties, tmp_path: Path):
+    log = tmp_path / "worker1" / "toys-1" / "log" / "worker-0.txt"
+    log.mkdir(parents=True)
+    party: Party = parties(on_loopback(), tmp_path)
+    output, reports = orders_to_worker1(party, "toys-1", Process("worker", 0))
+    assert reports == [Ended(Process("worker", 0), 1, f"it cannot be started: [Errno 21] Is a directory: '{log}'\n")]
+    assert (party.hosts["worker1"].returncode, output.splitlines()[-1]) == (0, "the end")
+
+
+@pytest.mark.slow
+def test_a_host_that_can_keep_nothing_says_so(parties, tmp_path: Path):
+    (tmp_path / "worker1").touch()
+    party: Party = parties(on_loopback(), tmp_path)
+    output = orders_to_worker1(party, "toys-1", Process("worker", 0))[0]
+    assert output.splitlines()[-1].endswith(f"{tmp_path / 'worker1' / 'toys-1'}: Not a directory"), output
+    assert party.hosts["worker1"].returncode == EXIT_REFUSED
+
+
+@pytest.mark.slow
+def test_a_host_hears_the_end_while_a_stage_prepares(parties, tmp_path: Path):
+    graph = tmp_path / "sums.yaml"
+    graph.write_text(SUMS.replace("survivors:Adder", "survivors:Preparing"))
+    party: Party = parties(on_loopback(), tmp_path, graph=graph)
+    party.start("head", f"adder.marks={tmp_path}")
+    party.start("worker1")
+    wait_until((tmp_path / "prepares").exists)
+    began = time.monotonic()
+    party.hosts["head"].send_signal(signal.SIGINT)
+    assert party.end("head").code == 130
+    assert party.end("worker1").output.splitlines()[-1] == "interrupted"
+    assert time.monotonic() - began < 30, "it has waited for the stage"
+    wait_until(lambda: processes_of(tmp_path) == [])
 
 
 def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
