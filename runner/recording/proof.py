@@ -44,8 +44,10 @@ class _Edge:
 
     source: str
     shared: bool
-    taken: dict[int, Intervals]
+    taken: defaultdict[int, Intervals]
     """By replica; under 0 for all that share them."""
+    done: defaultdict[tuple[int, str], Intervals]
+    """By replica and handler, the only messages of steps that were done: no other step may have them."""
 
 
 @dataclass(slots=True)
@@ -93,6 +95,8 @@ class Proof:
         """Checksums, by id, of the messages that may come again: no step has emitted them yet."""
         self._ambiguous: dict[str, None] = {}
         """Ids of those that came again as something else."""
+        self._again: list[str] = []
+        """Findings: messages that a step has done after another one had."""
         self._newest_ns = -1
         self._misplaced = 0
         """Records that do not follow the one before them in time, and the first of them:"""
@@ -185,8 +189,17 @@ class Proof:
 
     def _take(self, step: Step, input: str, port: str, number: int) -> None:
         edge = self._edges.get((step.stage, input))
-        if edge is not None and edge.source == port:
-            edge.taken.setdefault(0 if edge.shared else step.replica, Intervals()).add(number)
+        if edge is None or edge.source != port:
+            return
+        replica = 0 if edge.shared else step.replica
+        edge.taken[replica].add(number)
+        # A part may be dealt again while a replica works on it: to another one, by the successor of who sent it.
+        if step.outcome == "done" and len(step.consumed) == 1 and not edge.shared:
+            done = edge.done[replica, step.handler]
+            if number in done and len(self._again) < MOST_NAMED:
+                self._again.append(f"{_name('', step)} has done {port}#{number} again")
+            done.add(number)
+            done.keep(MOST_RANGES)
 
     def _shares_numbering(self, port: str) -> bool:
         """Whether replicas number what they answer by the part that they answer, so that there may be gaps."""
@@ -226,6 +239,7 @@ class Proof:
             more = f" and {self._misplaced - FEW} more" if self._misplaced > FEW else ""
             yield f"out of order: {', '.join(self._disorder)}{more}"
         yield from (f"two messages have the id {id}" for id in self._ambiguous)
+        yield from self._again
         yield from self._process_problems()
         yield from self._message_problems()
 
@@ -254,7 +268,7 @@ class Proof:
             for replica in () if edge.shared and self._is_lost(stage) else replicas:
                 if edge.shared or not self._is_lost(stage, replica):
                     name = f"{stage}.{input}" if len(replicas) == 1 else f"{stage}[{replica}].{input}"
-                    for start, stop in expected - edge.taken.get(replica, Intervals()):
+                    for start, stop in expected - edge.taken[replica]:
                         yield f"{name} neither consumed nor left {edge.source}#{_span(start, stop)}"
 
     def _is_lost(self, stage: str, replica: int | None = None) -> bool:
@@ -283,7 +297,7 @@ def _edges(stages: Mapping[str, _Stage]) -> Iterator[tuple[tuple[str, str], _Edg
         sources = {port: edge.source for port, edge in stage.inputs.items() if edge.policy != "latest"}
         sources |= {port: f"{SUPERVISOR}.{command_port(name, port)}" for port in stage.commands}
         for port, source in sources.items():
-            yield (name, port), _Edge(source, port in stage.shares, {})
+            yield (name, port), _Edge(source, port in stage.shares, defaultdict(Intervals), defaultdict(Intervals))
 
 
 def _stage_of(port: str) -> str:

@@ -145,6 +145,25 @@ def test_a_part_goes_to_one_of_the_replicas():
     assert found == ["filter.part neither consumed nor left camera.part#1"]
 
 
+def test_what_is_done_twice_is_named():
+    sent = ["camera.frame#0", step("camera/0/0", 0, emitted="camera.frame#0"), end("camera/0/0", 1)]
+    rest = [end("filter/1/0", 0, left="camera.frame#0"), *ended("camera/0/0", "filter/0/0", "filter/1/0")]
+    once, again = (step("filter/0/0", number, consumed="camera.frame#0") for number in (0, 1))
+    found, _ = prove(*sent, once, again, end("filter/0/0", 2), *rest)
+    assert found == ["step 1 of filter/0/0 has done camera.frame#0 again"]
+    stopped = msgspec.structs.replace(once, outcome="stopped")
+    successor = [msgspec.structs.replace(once, incarnation=1), end("filter/0/1", 1)]
+    assert prove(*sent, stopped, lost("filter/0/0"), *successor, *rest)[0] == []
+
+
+def test_what_is_joined_may_be_part_of_several_steps():
+    emitted = "camera.frame#0 camera.part#0 camera.part#1"
+    sent = [*emitted.split(), step("camera/0/0", 0, emitted=emitted), end("camera/0/0", 1)]
+    parts = [step("filter/0/0", number, consumed=f"camera.part#{number} camera.frame#0") for number in (0, 1)]
+    rest = [end("filter/1/0", 0, left="camera.frame#0"), *ended("camera/0/0", "filter/0/0", "filter/1/0")]
+    assert prove(*sent, *parts, end("filter/0/0", 2), *rest)[0] == []
+
+
 def test_a_command_is_for_the_stage_that_has_it():
     called = ["supervisor.camera_look#0", step("supervisor/0/0", 0, emitted="supervisor.camera_look#0")]
     rest = [end("supervisor/0/0", 1), *ended("supervisor/0/0", "camera/0/0")]
