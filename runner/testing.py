@@ -19,12 +19,12 @@ from typing import Any, TypeVar
 from runner.contract import Level, Message, Refused, Stage, name_of
 from runner.graph.document import suggest
 from runner.graph.graph import Edge, Node
-from runner.graph.ports import StageType, inspect_stage, port_name
+from runner.graph.ports import Handler, StageType, inspect_stage, port_name
 from runner.message import codec
 from runner.message.codec import Envelope, open_envelope
 from runner.message.ids import MessageId
-from runner.process.inbox import Inbox, Ready
-from runner.process.step import Executor, Log, receive, step_time
+from runner.process.inbox import Inbox
+from runner.process.step import Arrival, Executor, Log, receive, step_time
 from runner.recording.recording import Recording
 
 M = TypeVar("M", bound=Message)
@@ -61,15 +61,15 @@ def run_stage(
     ``folder`` is the context's directory; without, one that is gone afterwards. ``log`` takes what the stage says;
     without, it is printed. ``limit`` is how many messages are wanted, of a source that never ends.
     """
+    node, say = node_of(stage, name), log or _show
+    inbox, outputs = Inbox(node), node.type.outputs
     with contextlib.ExitStack() as stack:
         directory = folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        bench = Bench(node_of(stage, name), stage, seed=seed, directory=directory, log=log or _show)
-        emitted = (sealed for done in _steps(bench, given, times_ns) for sealed in done.emitted)
-        outputs = bench.node.type.outputs
-        messages = [
-            open_envelope(outputs[MessageId.of(sealed.id).port], sealed) for sealed in itertools.islice(emitted, limit)
-        ]
-        bench.say_what_is_left()
+        executor = Executor(node, stage, seed=seed, directory=directory, log=say)
+        emitted = itertools.islice(_emitted(node, inbox, executor, given, times_ns), limit)
+        messages = [open_envelope(outputs[MessageId.of(sealed.id).port], sealed) for sealed in emitted]
+        for handler, lineage, lacking in inbox.incomplete():
+            say(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
         return messages
 
 
@@ -81,63 +81,29 @@ def node_of(stage: Stage, name: str | None = None) -> Node:
     return Node(name or port_name(cls), f"{cls.__module__}:{cls.__qualname__}", kind, None, edges, 1, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Done:
-    """A step, and what it emitted."""
+def _emitted(
+    node: Node, inbox: Inbox, executor: Executor, given: Iterable[Given], times_ns: Sequence[int] | None
+) -> Iterator[Envelope]:
+    """What the stage emits, without bus, journal or recording: a step is over before its first message is here."""
 
-    ready: Ready
-    emitted: list[Envelope]
+    def step(handler: Handler, arrivals: Sequence[Arrival] = ()) -> list[Envelope]:
+        return list(executor.run(handler, arrivals, step_time(node, arrivals, time.time_ns())))
 
-
-class Bench:
-    """One stage in this process between its inbox and what it emits, without bus, journal or recording."""
-
-    def __init__(self, node: Node, stage: Stage, *, seed: int, directory: Path, log: Log) -> None:
-        self.node = node
-        self._inbox = Inbox(node)
-        self._executor = Executor(node, stage, seed=seed, directory=directory, log=log)
-        self._log = log
-
-    def start(self) -> Iterator[Done]:
-        """Runs the handlers that take nothing."""
-        for handler in self.node.type.handlers:
-            if not handler.inputs:
-                yield self._step(Ready(handler, ()))
-
-    def take(self, port: str, envelope: Envelope) -> Iterator[Done]:
-        """Takes a message and runs the steps that it makes possible."""
-        self._inbox.add(receive(self.node.type.inputs[port], envelope))
-        while (ready := self._inbox.pop()) is not None:
-            yield self._step(ready)
-
-    def advance(self) -> Iterator[Done]:
-        """Runs the source, where there is one, to its end; each message is a step."""
-        if (source := self.node.type.source) is not None:
-            for draft in self._executor.advance(source, time.time_ns):
-                if draft is not None:
-                    yield Done(Ready(source, ()), [draft.envelope])
-
-    def say_what_is_left(self) -> None:
-        """Logs what was never worked on."""
-        for handler, lineage, lacking in self._inbox.incomplete():
-            self._log(f"{handler.name} of {lineage} still lacks {', '.join(lacking)}", "debug")
-
-    def _step(self, ready: Ready) -> Done:
-        time_ns = step_time(self.node, ready.arrivals, time.time_ns())
-        return Done(ready, list(self._executor.run(ready.handler, ready.arrivals, time_ns)))
-
-
-def _steps(bench: Bench, given: Iterable[Given], times_ns: Sequence[int] | None) -> Iterator[Done]:
-    yield from bench.start()
+    for handler in node.type.handlers:
+        if not handler.inputs:
+            yield from step(handler)
     numbers = Counter[str]()
     times = itertools.count(0, PERIOD_NS) if times_ns is None else times_ns
     for item, (one, time_ns) in enumerate(zip(given, times, strict=times_ns is not None)):
-        for port, message in _by_port(bench.node.type, one):
+        for port, message in _by_port(node.type, one):
             id, lineage = f"given.{port}#{numbers[port]}", f"given.item#{item}"
             numbers[port] += 1
             sealed = codec.envelope(message, id=id, lineage=lineage, time_ns=time_ns, causes=())
-            yield from bench.take(port, sealed)
-    yield from bench.advance()
+            inbox.add(receive(node.type.inputs[port], sealed))
+            while (ready := inbox.pop()) is not None:
+                yield from step(ready.handler, ready.arrivals)
+    if (source := node.type.source) is not None:
+        yield from (draft.envelope for draft in executor.advance(source, time.time_ns) if draft is not None)
 
 
 def _by_port(kind: StageType, one: Given) -> Iterator[tuple[str, Message]]:

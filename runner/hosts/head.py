@@ -30,7 +30,6 @@ import msgspec
 from runner.contract import Level, Refused
 from runner.graph.document import Document, read_document, suggest
 from runner.graph.graph import NUMERICAL
-from runner.graph.packaged import portable_name
 from runner.graph.placement import Layout, Network
 from runner.inspect.compare import SHOWN, clipped
 from runner.message.packet import Packet, Process
@@ -332,7 +331,7 @@ class Hosts:
     def _moved(self, task: Assignment, hello: Hello) -> Assignment:
         """Paths below the folders of the head become paths below those of the host."""
         folders = {str(self._document.folder): hello.folder, str(Path.cwd()): hello.cwd}
-        return msgspec.structs.replace(task, entry=moved(task.entry, folders))
+        return msgspec.structs.replace(task, entry=provenance.portable(task.entry, folders))
 
 
 def introduce(document: Document, host: str, session: int) -> Hello:
@@ -369,16 +368,6 @@ def differences(own: Any, theirs: Any, key: str = "") -> Iterator[tuple[str, str
             yield from differences(mine.get(name, _MISSING), other.get(name, _MISSING), inner)
     elif own != theirs:
         yield key, _short(own), _short(theirs)
-
-
-def moved(value: Any, folders: Mapping[str, str]) -> Any:
-    """A copy of a tree in which paths below one folder are below another, and each host finds its own packages."""
-
-    def there(text: str) -> str:
-        start = next((old for old in folders if text.startswith(f"{old}/")), None)
-        return portable_name(Path(text)) or (text if start is None else folders[start] + text[len(start) :])
-
-    return provenance.with_texts(value, there)
 
 
 def _read(file: Path, offset: int) -> bytes:

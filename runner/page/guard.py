@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import secrets
 from urllib.parse import urlsplit
 
@@ -12,6 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
 from runner.contract import Refused
+from runner.graph.placement import Host
 
 TOKEN_CHARACTERS = 16
 """Of one that somebody chooses, at least."""
@@ -76,14 +76,6 @@ def _with_headers(send: Send) -> Send:
     return sending
 
 
-def is_loopback(address: str) -> bool:
-    """Whether an address or name means this machine and no other can call there."""
-    try:
-        return ipaddress.ip_address(address).is_loopback
-    except ValueError:
-        return address == "localhost"
-
-
 def new_token(address: str, chosen: str) -> str:
     """The token of a page at an address: ``chosen``, or one by chance. Raises Refused for a short one, and for none
     beyond loopback."""
@@ -91,6 +83,6 @@ def new_token(address: str, chosen: str) -> str:
         if len(chosen) < TOKEN_CHARACTERS or not chosen.replace("-", "").replace("_", "").isalnum():
             raise Refused(f"RUNNER_PAGE_TOKEN: must be {TOKEN_CHARACTERS} or more letters, digits, - and _")
         return chosen
-    if not is_loopback(address):
+    if not Host("page", address).loopback:
         raise Refused(f"--address {address}: a page beyond this machine needs a token: set RUNNER_PAGE_TOKEN")
     return secrets.token_urlsafe(TOKEN_CHARACTERS)

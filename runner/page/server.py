@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 import webbrowser
-from collections.abc import AsyncGenerator, Callable, Collection, Iterable
+from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -27,11 +27,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from runner.contract import Refused
+from runner.graph.placement import Host
 from runner.live.live import Live
 from runner.page import viewer
 from runner.page.calls import PageCalls
 from runner.page.feed import Feed
-from runner.page.guard import Guard, is_loopback, new_token
+from runner.page.guard import Guard, new_token
 from runner.page.history import past_runs
 from runner.page.past import Past, Pasts
 from runner.page.pictures import jpeg
@@ -194,16 +195,10 @@ class Page:
         self._photos = past | {photo.key: self._photos.get(photo.key) or jpeg(photo) for photo in photos}
 
     async def _photo(self, request: Request) -> Response:
-        jpeg = self._photos.get(request.path_params["key"])
-        if jpeg is None:
-            return PlainTextResponse("this picture is not kept any more\n", 404)
-        return Response(jpeg, media_type="image/jpeg")
+        return _found(self._photos, request, "this picture is not kept any more", "image/jpeg")
 
     async def _file(self, request: Request) -> Response:
-        data = self._files.get(request.path_params["key"])
-        if data is None:
-            return PlainTextResponse("this file is not kept any more\n", 404)
-        return Response(data, media_type="application/octet-stream")
+        return _found(self._files, request, "this file is not kept any more", "application/octet-stream")
 
     # ------------------------------------------------------------------------------------------ what is asked
 
@@ -226,21 +221,13 @@ class Page:
 
     async def _past(self, request: Request) -> Response:
         """A recording told again."""
-        try:
-            past = await self._retold(request, grown=False)
-        except (Refused, msgspec.ValidationError) as refusal:
-            return PlainTextResponse(str(refusal), 422)
+        past = await self._retold(request, grown=False)
         return Response(past.moments, media_type="application/json")
 
     async def _past_photo(self, request: Request) -> Response:
         """A picture of one; where that is not kept any more, it is told again."""
-        try:
-            picture = (await self._retold(request, grown=True)).photos.get(request.path_params["key"])
-        except (Refused, msgspec.ValidationError) as refusal:
-            return PlainTextResponse(str(refusal), 422)
-        if picture is None:
-            return PlainTextResponse("there is no such picture\n", 404)
-        return Response(picture, media_type="image/jpeg")
+        past = await self._retold(request, grown=True)
+        return _found(past.photos, request, "there is no such picture", "image/jpeg")
 
     async def _retold(self, request: Request, *, grown: bool) -> Past:
         language = msgspec.convert(request.path_params["language"], Language)
@@ -249,10 +236,7 @@ class Page:
     async def _drawn(self, request: Request) -> Response:
         """A recording for the viewer of the robot in 3D; that of the run that is shown grows as it goes on."""
         pieces = viewer.drawn(self._recording(request))
-        try:
-            first = await anext(pieces)
-        except Refused as refusal:
-            return PlainTextResponse(str(refusal), 422)
+        first = await anext(pieces)
 
         async def whole() -> AsyncGenerator[bytes]:
             async with contextlib.aclosing(pieces):
@@ -267,10 +251,7 @@ class Page:
         name = request.path_params["name"]
         if name not in viewer.FILES:
             return PlainTextResponse(f"{name}: no such file; valid: {', '.join(viewer.FILES)}\n", 404)
-        try:
-            self._viewer_files = self._viewer_files or await run_in_threadpool(viewer.viewer_files)
-        except Refused as refusal:
-            return PlainTextResponse(str(refusal), 422)
+        self._viewer_files = self._viewer_files or await run_in_threadpool(viewer.viewer_files)
         headers = {"content-security-policy": viewer.policy(self._viewer_files["index.html"])}
         return Response(self._viewer_files[name], media_type=viewer.FILES[name], headers=headers)
 
@@ -291,6 +272,18 @@ class Page:
             self._loop.call_soon_threadsafe(call)
 
 
+def _found(kept: Mapping[str, bytes], request: Request, lacking: str, media_type: str) -> Response:
+    """What is kept under the key that is asked for."""
+    if (data := kept.get(request.path_params["key"])) is None:
+        raise HTTPException(404, f"{lacking}\n")
+    return Response(data, media_type=media_type)
+
+
+def _refused(_: Request, refusal: Exception) -> Response:
+    """Says why something cannot be had."""
+    return PlainTextResponse(str(refusal), 422)
+
+
 def serve(entry: Entry, *, address: str, port: int, token: str) -> None:
     """Serves the page of a run until the run ends; prints where it is, and opens it where there is a browser.
 
@@ -301,9 +294,10 @@ def serve(entry: Entry, *, address: str, port: int, token: str) -> None:
     os.nice(NICE)
     listener = _listen(address, port)
     port = listener.getsockname()[1]
-    names = {address, "localhost", "127.0.0.1"} if is_loopback(address) else {address}
-    hosts = frozenset(f"{_quoted(name)}:{port}" for name in names)
-    url = f"http://{_quoted(address)}:{port}/{token}/"
+    own = Host("page", address, port)
+    names = {address, "localhost", "127.0.0.1"} if own.loopback else {address}
+    hosts = frozenset(str(Host("page", name, port)) for name in names)
+    url = f"http://{own}/{token}/"
 
     @contextlib.asynccontextmanager
     async def living(app: Starlette) -> AsyncGenerator[None]:
@@ -319,7 +313,8 @@ def serve(entry: Entry, *, address: str, port: int, token: str) -> None:
         with contextlib.suppress(asyncio.CancelledError):
             await task
 
-    app = Guard(Starlette(lifespan=living), token, hosts)
+    refusals = dict.fromkeys((Refused, msgspec.ValidationError), _refused)
+    app = Guard(Starlette(lifespan=living, exception_handlers=refusals), token, hosts)
     config = uvicorn.Config(
         app,
         log_level="warning",
@@ -341,7 +336,3 @@ def _listen(address: str, port: int) -> socket.socket:
         return socket.create_server((address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET)
     except OSError as error:
         raise Refused(f"{address}:{port}: nobody can listen there: {error.strerror}") from None
-
-
-def _quoted(address: str) -> str:
-    return f"[{address}]" if ":" in address else address

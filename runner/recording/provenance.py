@@ -199,14 +199,17 @@ def _hash(paths: Sequence[Path]) -> str:
     return hashlib.sha256(b"".join(found.digest() for found in (first, *others))).hexdigest()
 
 
-def portable(value: Any, root: Path) -> Any:
-    """A copy of a tree in which paths inside packages or below ``root`` are relative: others find their own files."""
+def portable(value: Any, folders: Mapping[str, str]) -> Any:
+    """A copy of a tree in which paths inside packages are relative, and those below one folder are below another:
+    everybody finds their own files.
+    """
 
-    def relative(text: str) -> str:
-        below = text.startswith(f"{root}/")
-        return portable_name(Path(text)) or (str(Path(text).relative_to(root)) if below else text)
+    def there(text: str) -> str:
+        start = next((old for old in folders if text.startswith(f"{old}/")), None)
+        below = text if start is None else str(Path(folders[start]) / text[len(start) + 1 :])
+        return portable_name(Path(text)) or below
 
-    return with_texts(value, relative)
+    return with_texts(value, there)
 
 
 def with_texts(value: Any, change: Callable[[str], str]) -> Any:

@@ -100,7 +100,7 @@ def topic(kind: type[Message]) -> Topic:
 
 def run_metadata(manifest: Manifest) -> dict[str, str]:
     """What ran where, as the recording keeps it: one JSON text per aspect."""
-    graph = provenance.portable(json.loads(manifest.graph), Path.cwd())
+    graph = provenance.portable(json.loads(manifest.graph), {str(Path.cwd()): ""})
     here, packages = provenance.machine(), provenance.package_versions()
     return {
         "format": FORMAT,

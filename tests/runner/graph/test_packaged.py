@@ -12,7 +12,6 @@ from runner.contract import Refused
 from runner.graph.graph import graph_to_json
 from runner.graph.packaged import find_graph, locate, portable_name
 from runner.graph.reading import graph_from_json, load_graph, node_from_entry
-from runner.hosts.head import moved
 from runner.recording.provenance import file_hashes, portable
 from runner.testing import finish, runner
 
@@ -93,9 +92,9 @@ def test_a_setting_of_a_packaged_graph_is_resolved_and_travels(package: Path, tm
     graph = load_graph(find_graph(Path("told")))
     words = package / "data/words.txt"
     assert graph.nodes["teller"].config.words == words
-    recorded = portable(json.loads(graph_to_json(graph)), tmp_path)
+    recorded = portable(json.loads(graph_to_json(graph)), {str(tmp_path): ""})
     assert recorded["stages"]["teller"]["config"] == {"words": "brought/data/words.txt"}
-    assert moved(str(words), {str(package): "/lab"}) == "brought/data/words.txt"
+    assert portable(str(words), {str(package): "/lab"}) == "brought/data/words.txt"
     # Wherever it is read again, and by whatever process, it is the file of the package that is there.
     assert graph_from_json(json.dumps(recorded)).nodes["teller"].config.words == words
     assert node_from_entry("teller", recorded["stages"]["teller"]).config.words == words

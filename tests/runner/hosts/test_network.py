@@ -17,9 +17,10 @@ from runner.graph.document import Document, read_document
 from runner.graph.graph import Graph, graph_to_json, node_entry
 from runner.graph.placement import Host, Layout, read_layout, read_owners
 from runner.graph.reading import graph_from_json, load_graph, node_from_entry
-from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, RemoteChild, differences, moved
+from runner.hosts.head import ABSENT_SECONDS, Hello, Hosts, RemoteChild, differences
 from runner.message.packet import Process
 from runner.process.children import spawn
+from runner.recording.provenance import portable
 from runner.supervise.child import Child
 from runner.testing import read_until
 from runner.transport import bus
@@ -175,7 +176,7 @@ def test_two_graph_files_are_compared_key_by_key():
 
 def test_paths_of_the_head_become_paths_of_the_host():
     entry = {"config": {"catalogue": "/lab/head/stages/x.yaml", "data": ["/data/ycb", "/lab/headless"], "n": 3}}
-    assert moved(entry, {"/lab/head": "/home/a"}) == {
+    assert portable(entry, {"/lab/head": "/home/a"}) == {
         "config": {"catalogue": "/home/a/stages/x.yaml", "data": ["/data/ycb", "/lab/headless"], "n": 3}
     }
 
