@@ -206,7 +206,7 @@ class Agent:
     def _end_all(self) -> None:
         """Asks what is left to end, then kills it."""
         for child in self._children.values():
-            child.handle.signal_group(signal.SIGTERM)
+            child.handle.send_signal(signal.SIGTERM)
         for child in self._children.values():
             end_process(child.handle, GRACE_SECONDS)
         self._forks.close()

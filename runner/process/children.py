@@ -44,6 +44,8 @@ LONGEST_PAUSE_SECONDS = 0.02
 """Between two looks whether a process has ended."""
 SHOWN_CHARACTERS = 100
 _AFTER = "after"
+_ENDS = "ends: "
+"""Marks last words among all that a process prints."""
 OOM_SCORE = 500
 """The kernel that runs out of memory takes a stage before the recorder and the supervisor, which explain it."""
 _PR_SET_PDEATHSIG = 1
@@ -216,10 +218,17 @@ def print_where_it_crashes() -> None:
     faulthandler.register(DUMP, all_threads=False)
 
 
-def last_words(text: str) -> None:
+def last_words(reason: str, details: str = "") -> None:
     """Prints why this process ends, which it does in the same way where its log is on a full disk."""
     with contextlib.suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
+        print(f"{details}{_ENDS}{' '.join(filter(None, reason.splitlines()))}", file=sys.stderr, flush=True)
+
+
+def reason_in(log: Path, start: int = 0) -> str:
+    """Why a child ended: its last words, whatever it printed after them, or without them the last that it printed."""
+    lines = last_lines(log, TAIL_BYTES, start)
+    words = [line.removeprefix(_ENDS) for line in lines if line.startswith(_ENDS)]
+    return next(reversed(words or lines), "")
 
 
 def prefer_for_oom_kill() -> None:

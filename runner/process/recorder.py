@@ -141,9 +141,10 @@ class Recorder:
         try:
             work()
         except BaseException as error:
-            self._writer.note_problem(f"the recorder failed: {type(error).__name__}: {error}".removesuffix(": "))
+            reason = f"the recorder failed: {type(error).__name__}: {error}".removesuffix(": ")
+            self._writer.note_problem(reason)
             self.stop()
-            last_words(traceback.format_exc())
+            last_words(reason, traceback.format_exc())
 
     # ------------------------------------------------------------------------------------------ what is heard
 

@@ -166,8 +166,10 @@ class StageProcess:
         with self._recorded:
             self._recorded.wait_for(lambda: self._recorded_steps >= self._steps, RECORDED_SECONDS)
         self._heartbeat.stop()
-        self._stage.close()
-        self._bus.close()
+        try:
+            self._stage.close()
+        finally:
+            self._bus.close()
 
     # ------------------------------------------------------------------------------------------ inputs
 
@@ -293,7 +295,8 @@ class StageProcess:
         except Refused as refusal:
             self._refuse_command(record, ready.handler, refusal)
         except BaseException as error:  # also who calls sys.exit() in a handler has failed
-            record.outcome, record.error = "failed", _summary(error)
+            record.outcome = "failed"
+            record.error = _summary(error)
             raise
         finally:
             emissions.close()
@@ -439,10 +442,14 @@ def _end_at_once(reason: str) -> NoReturn:
 
 
 def _summary(error: BaseException) -> str:
-    """An exception in one line: its type, its text and where it was raised."""
+    """An exception in one line: its type, its text and where it was raised. Raises nothing, whatever the exception."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
-    place = os.path.relpath(frame.filename)
-    return f"{type(error).__name__}: {error} ({place}:{frame.lineno} in {frame.name})"
+    text, place = "", frame.filename
+    with contextlib.suppress(Exception):
+        text = str(error)
+    with contextlib.suppress(OSError):  # the working folder may be gone
+        place = os.path.relpath(place)
+    return f"{type(error).__name__}: {text} ({place}:{frame.lineno} in {frame.name})"
 
 
 def prepare(task: bytes) -> None:
@@ -458,7 +465,7 @@ def _prepare(stage: str, entry: bytes) -> None:
 
 
 def main() -> int:
-    """Runs the stage that stdin assigns; the last line on stderr says why it ended with an error."""
+    """Runs the stage that stdin assigns; its last words say why it ended with an error."""
     print_where_it_crashes()
     die_with_parent()
     prefer_for_oom_kill()
@@ -467,23 +474,27 @@ def main() -> int:
         signal.signal(signum, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # there is nothing to finish before the stage is there
     assignment = msgspec.json.decode(sys.stdin.buffer.read(), type=Assignment)
-    process, code = None, 0
+    process, code, reason = None, 0, ""
     try:
         process = StageProcess(assignment)
         signal.signal(signal.SIGTERM, lambda *_: process.stop())
         signal.signal(signal.SIGUSR1, lambda *_: process.retire())
         process.run()
         if process.is_behind:
-            code = EXIT_FAILED
-            last_words("ended before it knew what its predecessor had left")
+            code, reason = EXIT_FAILED, "ended before it knew what its predecessor had left"
+            last_words(reason)
     except Refused as refusal:
-        code = EXIT_REFUSED
-        last_words(str(refusal))
+        code, reason = EXIT_REFUSED, str(refusal)
+        last_words(reason)
     except BaseException as error:
-        code = EXIT_FAILED
-        last_words(f"{traceback.format_exc()}{_summary(error)}")
+        code, reason = EXIT_FAILED, _summary(error)
+        last_words(reason, traceback.format_exc())
     if process is not None:
-        process.close(failed=code != 0)
+        try:
+            process.close(failed=code != 0)
+        except BaseException as error:
+            code = code or EXIT_FAILED
+            last_words(reason or _summary(error), traceback.format_exc())
     return code
 
 

@@ -13,7 +13,7 @@ from runner.inspect.info import byte_count
 from runner.message.codec import Pulse, Step, answered
 from runner.message.ids import REMEMBERED, number_on, numbered
 from runner.message.packet import Process
-from runner.process.children import Handle, ending, last_lines
+from runner.process.children import Handle, ending, reason_in
 from runner.process.health import Watch, oom_kills
 from runner.process.intake import Consumed
 from runner.recording.intervals import Intervals
@@ -53,12 +53,12 @@ class Child:
     """When its link went, on another host."""
 
     def reason(self, newest: Pulse | None = None) -> str:
-        """Why it ended: why it was killed, the signal, or the last thing it printed."""
+        """Why it ended: why it was killed, the signal, or what it said last."""
         if self.killed_because:
             return self.killed_because
         code = self.handle.returncode or 0
-        if code >= 0 and (lines := last_lines(self.log, 1, self.log_from)):
-            return lines[0]
+        if code >= 0 and (said := reason_in(self.log, self.log_from)):
+            return said
         if code > 0 and _is_full(self.log):
             return f"{ending(code)}: the disk of {self.log} is full"
         elsewhere = isinstance(self.handle, RemoteChild)  # whose kernel's count nobody here knows

@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from runner.terminal import Terminal
 
 STAGE_GRACE_SECONDS = 2.0
 """What a stage may take to finish its step before it is killed."""
+DEVICE_GRACE_SECONDS = 10.0
+"""The same for a device, which comes to rest in it."""
 SEEN_SECONDS = 0.5
 """How long it may take to hear that a process was ready that has died at once."""
 END_GRACE_SECONDS = 10.0
@@ -91,6 +94,8 @@ class Guardian:
         """Processes that say that they publish no messages any more."""
         self._ended: set[Process] = set()
         """Those that have journalled their end."""
+        self._named: set[Process] = set()
+        """Those whose bad end a person has been told."""
         self._started: dict[Process, float] = {}
         """When each was begun to be started, monotonic seconds: it may be there before that has come to its end."""
         self._ready: dict[Process, float] = {}
@@ -145,31 +150,55 @@ class Guardian:
     def name_the_dead(self) -> None:
         """Says what died just before the end, and is not replaced."""
         for child in self._children.values():
-            if child.handle.poll() and not child.replaced_because:
+            if child.handle.poll() and not child.replaced_because and child.process not in self._named:
+                self._named.add(child.process)
                 reason = child.reason(self.pulses.newest(child.process))
                 self._say(f"{self._run.name_of(child.process)} died meanwhile: {reason}", "warning")
                 self._show_output(child)
 
+    def wait_for_recorder(self) -> None:
+        """Waits until a recorder that has just been started hears what is said of the others."""
+        deadline = time.monotonic() + END_GRACE_SECONDS
+        while self._recorder is not None and self._recorder.handle.poll() is None and time.monotonic() < deadline:
+            if self.pulses.newest(self._recorder.process) is not None:
+                return
+            time.sleep(LOOK_SECONDS)
+
     def end(self) -> None:
-        """Ends the stages: each says what it leaves once nobody publishes any more. Says which are killed."""
+        """Ends the stages: each says what it leaves once nobody publishes any more. Says which have to be killed, and
+        which fail at that."""
         children = list(self._children.values())
         for child in children:
-            child.handle.signal_group(signal.SIGTERM)
+            child.handle.send_signal(signal.SIGTERM)
         for place in self._graph.processes():
             if place not in self._children:
                 self._declare_lost(Process(*place), "the graph ended before it was started")
-        deadline = time.monotonic() + STAGE_GRACE_SECONDS
-        while time.monotonic() < deadline and any(map(self._publishes, children)):
+        began, waiting = time.monotonic(), children
+        while waiting := list(filter(self._publishes, waiting)):
+            for child in waiting.copy():
+                device = self._graph.nodes[child.process.stage].type.cls.device
+                grace_seconds = DEVICE_GRACE_SECONDS if device else STAGE_GRACE_SECONDS
+                if time.monotonic() > began + grace_seconds:
+                    self._kill(child, f"killed: not at its end after {grace_seconds:g} s")
+                    waiting.remove(child)
             time.sleep(LOOK_SECONDS)
-        for child in filter(self._publishes, children):
-            child.killed_because = child.killed_because or f"killed: not at its end after {STAGE_GRACE_SECONDS:g} s"
-            end_process(child.handle, 0)
         for child in children:
             self._report_lost(child)
         deadline = time.monotonic() + END_GRACE_SECONDS
         for child in children:
-            end_process(child.handle, deadline - time.monotonic())
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.handle.wait(max(0.0, deadline - time.monotonic()))
+            if child.handle.poll() is None:
+                self._kill(child, f"killed: not gone {END_GRACE_SECONDS:g} s after its last step")
             self._report_lost(child)
+        self.name_the_dead()
+
+    def _kill(self, child: Child, reason: str) -> None:
+        if not child.killed_because:
+            child.killed_because = reason
+            self._named.add(child.process)
+            self._say(f"{self._run.name_of(child.process)} is {reason}", "warning")
+        end_process(child.handle, 0)
 
     def _publishes(self, child: Child) -> bool:
         return child.handle.poll() is None and child.process not in self.quiet
@@ -182,6 +211,8 @@ class Guardian:
                 end_process(child.handle, grace_seconds)
         if left := self._launch.close():
             self._say(f"the stages {behind(left)}", "warning")
+        for child in self._children.values():
+            child.handle.signal_group(signal.SIGKILL)  # what has cleared its environment
         return "was not begun" if self._recorder is None else self._recorder.reason()
 
     def _report_lost(self, child: Child) -> None:
@@ -324,6 +355,7 @@ class Guardian:
         process, name = child.process, self._run.name_of(child.process)
         reason = child.reason(self.pulses.newest(process))
         if child.handle.returncode == EXIT_REFUSED:
+            self._named.add(process)
             return End(EXIT_REFUSED, f"{name}: {reason}")
         retires = child.retires_by is not None and (child.handle.returncode == 0 or time.monotonic() > child.retires_by)
         if retires and not child.killed_because:
@@ -333,6 +365,7 @@ class Guardian:
         absent = process.place in self._absent()
         budget = 0 if self._run.forgets(process.stage) else self._graph.nodes[process.stage].restarts
         if absent or child.crashes >= budget:
+            self._named.add(process)
             self._show_output(child)
             return End(1, f"{name} failed {'at start-up' if absent else f'after {budget} restarts'}: {reason}")
         self._say(f"{name} restarts ({child.crashes + 1} of {budget}): {reason}", "warning")

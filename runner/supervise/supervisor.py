@@ -235,6 +235,7 @@ class Supervisor:
         with self._numbering:
             self._stopping.set()
             self._numbering.wait_for(lambda: not self._publishing, RECORDED_SECONDS)
+        self._guardian.wait_for_recorder()
         self._bus.publish(f"e/{self._own.path}", b"")
         self._guardian.end()
         self._journal((), "ended")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from runner.contract import EXIT_REFUSED, Message, Spec
 from runner.message.codec import Envelope, Journal, LogLine, Step, encode, envelope, pack, unpack
 from runner.message.packet import RECORDER, Packet, Process
-from runner.process.children import last_lines, spawn
+from runner.process.children import reason_in, spawn
 from runner.process.recorder import EXIT_INCOMPLETE
 from runner.recording.recording import Recording
 from runner.recording.writer import Manifest, topic
@@ -98,7 +98,7 @@ def test_records_a_30_hz_stream_of_rgbd_without_loss(tmp_path: Path, pictures: l
     recording = Recording(session.path)
     assert len(recording.messages) == len(recording.steps) == 60
     assert recording.verdict.complete
-    assert last_lines(session.log, 1) == [f"{session.path}: COMPLETE"]
+    assert reason_in(session.log) == f"{session.path}: COMPLETE"
     assert bytes(recording.envelope("camera.picture#59").body) == encode(pictures[2])
 
 
@@ -119,7 +119,7 @@ def test_a_lost_message_is_in_the_verdict_and_the_exit_status(tmp_path: Path, pi
     session.send(0, pictures[0])
     session.journal("camera.picture#0", "camera.picture#1")
     assert session.stop() == EXIT_INCOMPLETE
-    assert "INCOMPLETE: 1 missing: camera.picture#1" in last_lines(session.log, 1)[0]
+    assert "INCOMPLETE: 1 missing: camera.picture#1" in reason_in(session.log)
 
 
 def test_a_full_disk_stops_nobody_and_what_is_missing_is_named(tmp_path: Path, pictures: list[Picture]):
@@ -131,7 +131,7 @@ def test_a_full_disk_stops_nobody_and_what_is_missing_is_named(tmp_path: Path, p
     for id in sent:
         session.journal(id)
     assert session.stop() == EXIT_INCOMPLETE
-    said = last_lines(session.log, 1)[0]
+    said = reason_in(session.log)
     assert "INCOMPLETE: writing failed: File too large" in said
     recording = Recording(session.path)
     there = set(recording.messages)
@@ -170,7 +170,7 @@ def test_a_recording_that_cannot_be_created_is_refused(tmp_path: Path):
     (tmp_path / "pictures.mcap").touch()
     session = Session(tmp_path)
     assert session.process.wait(20) == EXIT_REFUSED
-    assert "cannot be created: File exists" in last_lines(session.log, 1)[0]
+    assert "cannot be created: File exists" in reason_in(session.log)
     session.bus.close()
 
 
@@ -182,7 +182,7 @@ def test_a_recording_that_cannot_be_begun_is_refused(tmp_path: Path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert session.process.wait(20) == EXIT_REFUSED
-    assert last_lines(session.log, 1) == [f"recording {session.path}: cannot be written: File too large"]
+    assert reason_in(session.log) == f"recording {session.path}: cannot be written: File too large"
     session.bus.close()
 
 
@@ -194,7 +194,7 @@ def test_a_recorder_that_fails_ends_and_the_recording_says_why(tmp_path: Path, w
     assert session.process.wait(20) == EXIT_INCOMPLETE
     session.bus.close()
     reason = "the recorder failed: MemoryError: no room for a step"
-    assert last_lines(session.log, 1)[0].startswith(f"{session.path}: INCOMPLETE: {reason}; ")
+    assert reason_in(session.log).startswith(f"{session.path}: INCOMPLETE: {reason}; ")
     assert "Traceback" in session.log.read_text()
     assert reason in str(Recording(session.path).verdict)
 

@@ -20,7 +20,7 @@ from runner.graph.reading import load_graph
 from runner.message.codec import CodecError, Deal, Envelope, Journal, LogLine, Lost, Pulse, Step, envelope, pack, unpack
 from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
-from runner.process.children import last_lines, spawn
+from runner.process.children import last_lines, reason_in, spawn
 from runner.process.stage_process import Assignment
 from runner.recording.recording import Recording
 from runner.recording.writer import Manifest
@@ -239,7 +239,7 @@ def test_bad_messages_of_the_run_itself_crash_no_process(tmp_path: Path):
         process.terminate()
     assert (host.wait(60), recorder.wait(60)) == (0, 1), last_lines(tmp_path / "host.txt", 9)
     bus.close()
-    assert "malformed" not in "".join(last_lines(tmp_path / "recorder.txt", 1))
+    assert "malformed" not in reason_in(tmp_path / "recorder.txt")
     assert Recording(tmp_path / "bad.mcap").damage == []
 
 
