@@ -36,7 +36,8 @@ def test_mesh_is_dense_enough_for_its_pattern_and_centred(name: str) -> None:
 @pytest.mark.parametrize("name", BUILT)
 def test_file_in_the_repository_is_what_the_code_builds(name: str) -> None:
     stored = read_mesh(FOLDER / f"{name}.ply", 1.0)
-    np.testing.assert_array_equal(stored.vertices, BUILT[name].vertices)
+    # Not every processor has the same sine to the last bit.
+    np.testing.assert_allclose(stored.vertices, BUILT[name].vertices, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(stored.faces, BUILT[name].faces)
     np.testing.assert_array_equal(stored.colors, BUILT[name].colors)
 
