@@ -9,7 +9,7 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from runner.contract import Level, Message, Stage
+from runner.contract import Level, Message, Part, Stage
 from runner.graph.graph import Node
 from runner.graph.ports import Handler, InputPort, port_name
 from runner.message import codec
@@ -42,6 +42,15 @@ def receive(port: InputPort, envelope: Envelope, *, arrived_ns: int = 0, travell
     """Decodes what arrived at a port; raises CodecError where it is not of the port's type."""
     message = codec.open_envelope(port.type, envelope)
     return Arrival(port, envelope, message, arrived_ns, travelled_ns)
+
+
+class _Emitted(msgspec.Struct):
+    """What one step has emitted, as far as the next message must agree with it."""
+
+    ports: set[str] = msgspec.field(default_factory=set[str])
+    """Of a stage with replicas."""
+    parts: dict[str, tuple[int, set[int]]] = msgspec.field(default_factory=dict[str, tuple[int, set[int]]])
+    """Count and indices of the parts in the step's lineage, by port."""
 
 
 class StepContext:
@@ -106,7 +115,7 @@ class Executor:
 
         ``arrivals`` are in the order of the handler's parameters, the parts of a gather by index;
         ``time_ns`` is the step's logical time. Raises whatever the handler raises, CodecError for a message
-        that breaks its class and BrokenContract for one that the annotations do not announce.
+        that breaks its class and BrokenContract for one that the annotations do not announce, or a part that is none.
         """
         driver = driver_of(handler, arrivals)
         context = self._context(handler, driver, time_ns)
@@ -114,10 +123,10 @@ class Executor:
         if handler.context is not None:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
-        taken: set[str] = set()
+        emitted = _Emitted()
         for message in _messages(getattr(self._stage, handler.name)(**arguments)):
             if message is not None:
-                yield self._draft(message, driver, causes, context.time_ns, taken)
+                yield self._draft(message, driver, causes, context.time_ns, emitted)
             elif self._node.type.cls.device:
                 yield None
             else:
@@ -129,7 +138,7 @@ class Executor:
         arguments = {} if handler.context is None else {handler.context: context}
         for message in getattr(self._stage, handler.name)(**arguments):
             context.time_ns = clock()
-            yield None if message is None else self._draft(message, None, (), context.time_ns, set())
+            yield None if message is None else self._draft(message, None, (), context.time_ns, _Emitted())
 
     def _context(self, handler: Handler, driver: Envelope | None, time_ns: int) -> StepContext:
         identity = handler.name if driver is None else driver.id
@@ -137,12 +146,15 @@ class Executor:
         return StepContext(time_ns=time_ns, seed=seed, directory=self._directory, log=self._log)
 
     def _draft(
-        self, message: Message, driver: Envelope | None, causes: tuple[str, ...], time_ns: int, taken: set[str]
+        self, message: Message, driver: Envelope | None, causes: tuple[str, ...], time_ns: int, emitted: _Emitted
     ) -> Draft:
         port = self._port_of(message)
-        own = str(MessageId(self._node.name, port, self._number(port, driver, taken)))
+        own = str(MessageId(self._node.name, port, self._number(port, driver, emitted.ports)))
         lineage = own if driver is None or message.starts_lineage else driver.lineage
-        return codec.draft(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
+        draft = codec.draft(message, id=own, lineage=lineage, time_ns=time_ns, causes=causes)
+        if isinstance(message, Part):
+            _check_part(message, port, emitted.parts if lineage != own else {})
+        return draft
 
     def _port_of(self, message: Message) -> str:
         port = port_name(type(message))
@@ -161,6 +173,21 @@ class Executor:
         number = self._numbers.get(port, 0)
         self._numbers[port] = number + 1
         return number
+
+
+def _check_part(part: Part, port: str, siblings: dict[str, tuple[int, set[int]]]) -> None:
+    """Raises BrokenContract for a part that no gather could ever put among the others."""
+    emitted = f"emitted {port} with index {part.index} of {part.count}"
+    if part.count < 1:
+        raise BrokenContract(f"{emitted}; valid: a count of 1 and more")
+    if not 0 <= part.index < part.count:
+        raise BrokenContract(f"{emitted}; valid: 0 to {part.count - 1}")
+    count, indices = siblings.setdefault(port, (part.count, set()))
+    if part.count != count:
+        raise BrokenContract(f"{emitted}, after one of {count} in the same step; valid: the same count")
+    if part.index in indices:
+        raise BrokenContract(f"{emitted} twice in one step; valid: each index from 0 to {count - 1} once")
+    indices.add(part.index)
 
 
 def step_seed(seed: int, stage: str, identity: str) -> int:

@@ -143,6 +143,36 @@ def test_errors_are_those_of_the_handler():
         run_stage(Liar(), [Number(value=0, last=True)])
 
 
+class Cutter(Stage):
+    """Emits pieces as it is told: (index, count) of each."""
+
+    def __init__(self, *pieces: tuple[int, int]) -> None:
+        self._pieces = pieces
+
+    def on_number(self, number: Number) -> Iterator[Piece]:
+        for index, count in self._pieces:
+            yield Piece(index=index, count=count, value=number.value)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "reason"),
+    [
+        ([(5, 2)], "emitted piece with index 5 of 2; valid: 0 to 1"),
+        ([(0, 2), (-1, 2)], "emitted piece with index -1 of 2; valid: 0 to 1"),
+        ([(0, 0)], "emitted piece with index 0 of 0; valid: a count of 1 and more"),
+        ([(0, 2), (0, 2)], "emitted piece with index 0 of 2 twice in one step; valid: each index from 0 to 1 once"),
+        ([(0, 2), (1, 3)], "emitted piece with index 1 of 3, after one of 2 in the same step; valid: the same count"),
+    ],
+)
+def test_a_part_that_no_gather_could_take_breaks_the_contract(pieces: list[tuple[int, int]], reason: str):
+    with pytest.raises(BrokenContract, match=f"^{re.escape(reason)}$"):
+        run_stage(Cutter(*pieces), [Number(value=0)])
+
+
+def test_parts_may_come_in_any_order_and_again_in_the_next_step():
+    assert len(run_stage(Cutter((1, 2), (0, 2)), [Number(value=0), Number(value=1)])) == 4
+
+
 class Subtract(Stage):
     """Has two inputs of one type."""
 
