@@ -509,11 +509,11 @@ def _codec_error(type_name: str, error: Exception) -> CodecError:
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON Schema of the map that carries one message type: the envelope with its body."""
-    _, definitions = msgspec.json.schema_components(
-        [kind, Envelope], schema_hook=_array_schema, ref_template="#/$defs/{name}"
+    (place,), definitions = msgspec.json.schema_components(
+        [kind], schema_hook=_array_schema, ref_template="#/$defs/{name}"
     )
-    body = definitions.pop(kind.__name__)
-    schema = definitions.pop("Envelope")
+    body = definitions.pop(place["$ref"].rpartition("/")[2])
+    (schema,) = msgspec.json.schema_components([Envelope])[1].values()
     schema["title"], schema["properties"]["body"] = name_of(kind), body
     return {**schema, "$defs": definitions} if definitions else schema
 

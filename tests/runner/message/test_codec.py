@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from runner.contract import Message, Spec, Struct
 from runner.message import codec
 from runner.message.codec import CodecError, Envelope, LogLine, Step
+from tests.runner.common import toys
 
 Image = Annotated[NDArray[np.uint8], Spec("uint8", ("H", "W", 3))]
 Square = Annotated[NDArray[np.float64], Spec("float64", ("N", "N"))]
@@ -331,3 +332,26 @@ def test_the_schema_describes_what_is_on_the_wire():
     text = json.loads(json.dumps(wire, default=lambda data: data.decode("latin-1")))
     jsonschema.validate(text, schema)
     assert schema["title"] == "Sample"
+
+
+class Number(Message, frozen=True, kw_only=True):
+    number: toys.Number
+
+
+def called(name: str, **fields: float) -> Message:
+    """A message of a class with a name."""
+    kinds = [(field, type(value)) for field, value in fields.items()]
+    return msgspec.defstruct(name, kinds, bases=(Message,), frozen=True, kw_only=True)(**fields)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [Number(number=toys.Number(value=3)), called("Größe", höhe=0.5), called("Envelope", height=0.5)],
+    ids=["inside", "letters", "envelope"],
+)
+def test_any_class_name_has_a_schema(message: Message):
+    """Also one that a class inside has too, or the record around it."""
+    schema = codec.json_schema(type(message))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(msgpack.unpackb(codec.pack(sealed(message))), schema)
+    assert schema["title"] == type(message).__name__
