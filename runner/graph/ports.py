@@ -2,14 +2,13 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator, Set
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
-
-import msgspec
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from runner.contract import Command, Context, Message, Part, Refused, Stage, name_of
+from runner.message.classes import refuse_class
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,24 +174,10 @@ def _refuse_inputs(cls: type[Stage], method: str, inputs: list[InputPort]) -> No
 def _why_no_message(kind: type[Message]) -> str:
     """Why a type cannot be sent; empty where it can. Many stages have the same types."""
     try:
-        _refuse_sets(kind.__name__, kind, set())
+        refuse_class(kind)
     except Refused as refusal:
         return str(refusal)
     return ""
-
-
-def _refuse_sets(place: str, annotation: Any, known: set[Any]) -> None:
-    """Refuses sets in a type: their order is another in each process, and with it the bytes."""
-    kind = get_origin(annotation) or annotation
-    if isinstance(kind, type) and issubclass(kind, Set):
-        raise Refused(f"{place}: a set has no order; valid: tuple")
-    if isinstance(kind, type) and (issubclass(kind, msgspec.Struct) or is_dataclass(kind)) and kind not in known:
-        known.add(kind)
-        for name, hint in _resolved(place, kind).items():
-            if get_origin(hint) is not ClassVar:
-                _refuse_sets(f"{place}.{name}", hint, known)
-    for argument in get_args(annotation):
-        _refuse_sets(place, argument, known)
 
 
 def _message_types(annotation: Any) -> Iterator[type[Message]]:

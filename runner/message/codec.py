@@ -3,10 +3,25 @@
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
 from functools import cache
 from itertools import repeat
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NotRequired,
+    Required,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 import msgspec
 import numpy as np
@@ -260,27 +275,51 @@ Check = Callable[[Any], None]
 """Checks the arrays inside one value; raises ValueError, with the place within the value as msgspec gives it."""
 
 
+def is_record(kind: Any) -> bool:
+    """True for what has fields with names: structs, dataclasses, named tuples and dictionaries with types."""
+    named = isinstance(kind, type) and (issubclass(kind, msgspec.Struct) or hasattr(kind, "_fields"))
+    return named or (isinstance(kind, type) and is_dataclass(kind)) or is_typeddict(kind)
+
+
+def fields_of(kind: Any) -> dict[str, Any]:
+    """The annotation of each field of a record."""
+    hints = get_type_hints(kind, include_extras=True).items()
+    fields = ((name, hint) for name, hint in hints if ClassVar not in (hint, get_origin(hint)))
+    told = (Required, NotRequired)  # of dictionaries with types
+    return {name: get_args(hint)[0] if get_origin(hint) in told else hint for name, hint in fields}
+
+
+def spec_of(annotation: Any) -> Spec | None:
+    """What an annotation says of its array."""
+    extras = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
+    return next((extra for extra in extras if isinstance(extra, Spec)), None)
+
+
 @cache
-def _struct_checks(kind: type[msgspec.Struct]) -> tuple[tuple[str, Check], ...]:
-    """The fields of a struct that may hold arrays, each with its check."""
-    hints = get_type_hints(kind, include_extras=True)
-    checks = ((name, _check_of(hints[name])) for name in kind.__struct_fields__)
-    return tuple((name, check) for name, check in checks if check is not None)
+def _record_checks(kind: Any) -> dict[str, Check]:
+    """The fields of a record that may hold arrays, each with its check."""
+    checks = ((name, _check_of(hint)) for name, hint in fields_of(kind).items())
+    return {name: check for name, check in checks if check is not None}
 
 
 def _check_of(annotation: Any) -> Check | None:
     """The check for values of one annotation, or None where they hold no arrays."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        spec = next((extra for extra in arguments[1:] if isinstance(extra, Spec)), None)
+        spec = spec_of(annotation)
         return _check_of(arguments[0]) if spec is None else lambda value: _check_array(value, spec)
     if origin is np.ndarray or annotation is np.ndarray:
         raise TypeError("an array field needs its Spec: Annotated[NDArray[...], Spec(dtype, shape)]")
-    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+    if is_typeddict(annotation):
+        return lambda value: _check_each(value.items(), map(_record_checks(annotation).get, value))
+    if is_record(annotation):
         return _check_struct
     checks = [_check_of(argument) for argument in arguments]
-    if not any(checks):
-        return None
+    return _check_inside(origin, arguments, checks) if any(checks) else None
+
+
+def _check_inside(origin: Any, arguments: tuple[Any, ...], checks: list[Check | None]) -> Check:
+    """The check for the members of a union or the values in a container, of which each argument has its own."""
     if origin in (Union, UnionType):
         return _check_member(arguments, checks)
     if issubclass(cast("type", origin), Mapping):
@@ -290,7 +329,7 @@ def _check_of(annotation: Any) -> Check | None:
 
 
 def _check_struct(value: Any) -> None:
-    for name, check in _struct_checks(type(value)):
+    for name, check in _record_checks(type(value)).items():
         try:
             check(getattr(value, name))
         except ValueError as error:
@@ -310,6 +349,7 @@ def _check_each(items: Iterable[tuple[Any, Any]], checks: Iterable[Check | None]
 def _check_member(members: tuple[Any, ...], checks: list[Check | None]) -> Check:
     """Checks a value as the member of a union that it is: msgspec takes members of different kinds only."""
     bare = (get_args(member)[0] if get_origin(member) is Annotated else member for member in members)
+    bare = (dict if is_typeddict(kind) else kind for kind in bare)
     kinds = [(get_origin(kind) or kind, check) for kind, check in zip(bare, checks, strict=True) if check is not None]
 
     def check_member(value: Any) -> None:
@@ -509,13 +549,16 @@ def _codec_error(type_name: str, error: Exception) -> CodecError:
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON Schema of the map that carries one message type: the envelope with its body."""
-    (place,), definitions = msgspec.json.schema_components(
-        [kind], schema_hook=_array_schema, ref_template="#/$defs/{name}"
-    )
+    (place,), definitions = describe(kind)
     body = definitions.pop(place["$ref"].rpartition("/")[2])
     (schema,) = msgspec.json.schema_components([Envelope])[1].values()
     schema["title"], schema["properties"]["body"] = name_of(kind), body
     return {**schema, "$defs": definitions} if definitions else schema
+
+
+def describe(annotation: Any) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:
+    """JSON Schema of values of a type, and of all classes inside by name; raises TypeError where it cannot travel."""
+    return msgspec.json.schema_components([annotation], schema_hook=_array_schema, ref_template="#/$defs/{name}")
 
 
 def _array_schema(kind: type) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, NotRequired, Required, TypedDict
 from unittest import mock
 
 import jsonschema
@@ -197,6 +198,21 @@ class Cube(Struct, frozen=True, kw_only=True, tag=True):
     sides: Square
 
 
+@dataclass(frozen=True)
+class Plate:
+    corners: Square
+
+
+class Pair(NamedTuple):
+    left: Mask
+    right: Square
+
+
+class Shelf(TypedDict):
+    boards: Required[tuple[Square, ...]]
+    flags: NotRequired[Mask]
+
+
 class Nest(Message, frozen=True, kw_only=True):
     """Arrays wherever they can be."""
 
@@ -205,6 +221,9 @@ class Nest(Message, frozen=True, kw_only=True):
     many: tuple[Square, ...] | Mapping[str, Square] = ()
     either: Ball | Cube | None = None
     deep: list[dict[str, tuple[Ball | Cube, ...]]] = msgspec.field(default_factory=list)
+    plate: Plate | None = None
+    named: Pair | None = None
+    shelf: Shelf | None = None
 
 
 masks = hnp.arrays(np.bool_, st.integers(0, 5))
@@ -220,6 +239,9 @@ nests = st.builds(
     deep=st.lists(
         st.dictionaries(st.text(max_size=3), st.lists(shapes, max_size=2).map(tuple), max_size=2), max_size=2
     ),
+    plate=st.none() | st.builds(Plate, corners=squares),
+    named=st.none() | st.builds(Pair, left=masks, right=squares),
+    shelf=st.none() | st.fixed_dictionaries({"boards": st.tuples(squares)}, optional={"flags": masks}),
 )
 NOT_SQUARE, NOT_FINITE, NOT_FLOAT = np.zeros((1, 2)), np.full((1, 1), np.inf), np.zeros((2, 2), np.float32)
 
@@ -239,6 +261,9 @@ def test_arrays_are_checked_wherever_they_are(wrong: np.ndarray, nest: Nest, num
         f"many[{number}]": {"many": (*first, wrong)},
         "many['a']": {"many": {"a": wrong}},
         "either.sides": {"either": Cube(sides=wrong)},
+        "plate.corners": {"plate": Plate(wrong)},
+        "named.right": {"named": Pair(flag, wrong)},
+        f"shelf['boards'][{number}]": {"shelf": {"flags": flag, "boards": (*first, wrong)}},
         f"deep[0]['a'][{number}].sides": {"deep": [{"a": (*(Ball(radii=flag) for _ in first), Cube(sides=wrong))}]},
     }
     for place, changes in places.items():
@@ -341,7 +366,8 @@ class Number(Message, frozen=True, kw_only=True):
 def called(name: str, **fields: float) -> Message:
     """A message of a class with a name."""
     kinds = [(field, type(value)) for field, value in fields.items()]
-    return msgspec.defstruct(name, kinds, bases=(Message,), frozen=True, kw_only=True)(**fields)
+    kind: Any = msgspec.defstruct(name, kinds, bases=(Message,), frozen=True, kw_only=True)
+    return kind(**fields)
 
 
 @pytest.mark.parametrize(
