@@ -228,12 +228,12 @@ class Graph(GraphKeys, frozen=True, kw_only=True):
             for name, kind in node.type.commands.items()
         }
 
-    def load(self, key: str, reference: str) -> Any:
+    def load(self, key: str, reference: str, wanted: type[Any] | None = None) -> Any:
         """An instance of the class ``module:Class`` that a key names, given the settings of every stage by its name.
 
-        Raises Refused where there is no such class.
+        Raises Refused where there is no such class, or one without the methods of the protocol ``wanted``.
         """
-        cls = load_class(reference, f"{key} of graph {self.name!r}")
+        cls = load_class(reference, f"{key} of graph {self.name!r}", wanted)
         return cls({name: node_entry(node)["config"] for name, node in self.nodes.items()})
 
     def processes(self) -> list[tuple[str, int]]:

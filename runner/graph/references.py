@@ -1,6 +1,7 @@
 """Finds what a graph names as ``module:NAME``: classes and tables."""
 
 import importlib
+import inspect
 import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -15,14 +16,23 @@ from runner.graph.packaged import find
 T = TypeVar("T")
 
 
-def load_class(reference: str, place: str) -> Any:
-    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one."""
+def load_class(reference: str, place: str, wanted: type[Any] | None = None) -> Any:
+    """The object named ``module:Class``; raises Refused with the valid names beside the wrong one.
+
+    Refuses a class, too, that has not all methods of the protocol ``wanted``.
+    """
     module_name, _, class_name = reference.partition(":")
     members = vars(_module(module_name, place))
     if class_name not in members:
         classes = [name for name, one in members.items() if isinstance(one, type) and one.__module__ == module_name]
         raise Refused(f"{place}: no class {class_name!r} in {module_name}{suggest(class_name, classes)}")
-    return members[class_name]
+    found = members[class_name]
+    methods = [
+        name for name, one in (vars(wanted) if wanted else {}).items() if inspect.isfunction(one) and name[:1] != "_"
+    ]
+    if missing := [name for name in methods if not callable(getattr(found, name, None))]:
+        raise Refused(f"{place}: {reference} has no {', '.join(missing)}; valid: a class with {', '.join(methods)}")
+    return found
 
 
 def modules_of(graph: Mapping[str, Any]) -> list[str]:

@@ -309,4 +309,4 @@ def load_story(graph: Graph) -> Story | None:
     """The story a graph names; None where it names none. Raises Refused where it cannot be loaded."""
     if graph.story is None:
         return None
-    return graph.load("story", graph.story)
+    return graph.load("story", graph.story, Story)

@@ -52,4 +52,4 @@ def load_views(graph: Graph) -> Views:
     """The views a graph names; raises Refused where it names none or they cannot be loaded."""
     if graph.view is None:
         raise Refused(f"graph {graph.name!r} names no views; valid: a line `view: module:Class` in the graph file")
-    return graph.load("view", graph.view)
+    return graph.load("view", graph.view, Views)

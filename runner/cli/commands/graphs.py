@@ -9,7 +9,7 @@ import json
 from typing import TYPE_CHECKING
 
 from runner.cli.commands import Commands, add, add_graph, add_recordings, add_settings, graph_file
-from runner.contract import Refused
+from runner.contract import Refused, Scorer
 from runner.terminal import Terminal
 
 if TYPE_CHECKING:
@@ -130,11 +130,14 @@ def _take_part(options: argparse.Namespace, document: Document, host: str, termi
 def _check(options: argparse.Namespace) -> None:
     from runner.graph.reading import load_graph
     from runner.graph.references import load_class
+    from runner.page.story import Story
+    from runner.view.drawing import Views
 
     graph = load_graph(options.graph, options.settings)
-    for key, reference in (("view", graph.view), ("story", graph.story), ("score", graph.score)):
+    named = (("view", graph.view, Views), ("story", graph.story, Story), ("score", graph.score, Scorer))
+    for key, reference, wanted in named:
         if reference is not None:
-            load_class(reference, f"{options.graph}: {key}")
+            load_class(reference, f"{options.graph}: {key}", wanted)
     commands = len(graph.commands())
     edges = sum(len(node.inputs) for node in graph.nodes.values()) - commands
     counts = (f"{len(graph.nodes)} stages", f"{len(graph.processes())} processes", f"{edges} edges")

@@ -70,6 +70,15 @@ def no_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["check", *GRAPH, "stages={1: 2}"], "--set stages: a stage's name is lower case letters"),
         (["check", *GRAPH, "stages=.nan", "--set", "worker.host=a"], "--set worker.host: no stage 'worker'"),
         (["check", *GRAPH, 'worker.seconds="\\ud800"'], "--set worker.seconds: Expected `float`, got "),
+        (
+            ["check", *GRAPH, f"view={__name__}:Moody"],
+            f"view: {__name__}:Moody has no layout, static, draw; valid: a",
+        ),
+        (
+            ["check", *GRAPH, f"story={__name__}:Moody"],
+            f"story: {__name__}:Moody has no hear, recall, tell, say; ",
+        ),
+        (["check", *GRAPH, f"score={__name__}:Moody"], f"score: {__name__}:Moody has no score; valid: a class with sc"),
         (["check", *GRAPH, "migrations=..:x"], "--set migrations: no module '..'"),
         (["check", *GRAPH, "migrations=:x"], "--set migrations: no module ''"),
     ],
