@@ -77,6 +77,8 @@ class StageType:
 
 def inspect_stage(cls: type[Stage]) -> StageType:
     """Reads a stage class; raises Refused naming class, method and parameter where it breaks the contract."""
+    if cls.device and cls.stateful:
+        raise Refused(f"{cls.__name__}: is a device and stateful; valid: one of both, for its past lies outside")
     handlers = tuple(_handler(cls, name) for name in _handler_names(cls))
     source = _handler(cls, "source") if hasattr(cls, "source") else None
     if source is not None and not cls.device:
@@ -91,6 +93,19 @@ def inspect_stage(cls: type[Stage]) -> StageType:
             raise Refused(f"{cls.__name__}: {reason}")
     outputs = {port_name(kind): kind for kind in emitted}
     return StageType(cls, handlers, source, outputs, _config_type(cls))
+
+
+def refuse_construction(kind: StageType) -> None:
+    """Raises Refused where a graph could not construct a stage, whatever its settings are."""
+    cls = kind.cls
+    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
+        raise Refused(f"{cls.__name__}: is abstract, it has no {', '.join(missing)}")
+    arguments = () if kind.config is None else (kind.config,)
+    try:
+        inspect.signature(cls).bind(*arguments)
+    except TypeError as error:
+        valid = "self, config: Config" if arguments else "self"
+        raise Refused(f"{cls.__name__}.__init__: {error}; valid: def __init__({valid})") from None
 
 
 def refuse_shared(place: str, ports: Iterable[tuple[str, str]]) -> None:
@@ -127,13 +142,30 @@ def _handler(cls: type[Stage], name: str) -> Handler:
 
 def _hints(cls: type[Stage], name: str) -> dict[str, Any]:
     """Resolved annotations of a method's parameters, in their order, and of its result; each must have one."""
+    place = f"{cls.__name__}.{name}"
+    if reason := _why_no_handler(inspect.getattr_static(cls, name)):
+        raise Refused(f"{place}: {reason}; valid: def {name}(self, ...), or another name")
     method: Callable[..., Any] = getattr(cls, name)
-    hints = _resolved(f"{cls.__name__}.{name}", method)
-    parameters = (*list(inspect.signature(method).parameters)[1:], "return")
+    hints = _resolved(place, method)
+    _, *signature = inspect.signature(method).parameters.values()
+    for one in signature:
+        if one.kind not in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY):
+            raise Refused(f"{place}({one.name}): is {one.kind.description}, and messages are given by name")
+    parameters = (*(one.name for one in signature), "return")
     for parameter in parameters:
         if parameter not in hints:
             raise Refused(f"{cls.__name__}.{name}({parameter}): has no annotation")
     return {parameter: hints[parameter] for parameter in parameters}
+
+
+def _why_no_handler(member: Any) -> str:
+    """Why what a class has under the name of a handler is none; empty where it is one."""
+    other = isinstance(member, staticmethod | classmethod) or not callable(member)
+    if other or not (inspect.isroutine(member) or hasattr(member, "__wrapped__")):
+        return f"is of type {type(member).__name__} and no method"
+    if inspect.iscoroutinefunction(member) or inspect.isasyncgenfunction(member):
+        return "is async, and nobody would await it"
+    return ""
 
 
 def _resolved(place: str, what: Callable[..., Any]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from runner.graph.graph import (
 )
 from runner.graph.packaged import locate
 from runner.graph.placement import check_listen, read_layout
-from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_shared
+from runner.graph.ports import InputPort, StageType, inspect_stage, port_name, refuse_construction, refuse_shared
 from runner.graph.references import load_class, load_migrations, load_tolerances
 
 T = TypeVar("T")
@@ -247,9 +247,11 @@ def _load(document: Document, name: str, entry: StageEntry) -> StageType:
     if not (isinstance(cls, type) and issubclass(cls, Stage)):
         raise Refused(f"{place}: {entry.stage} is not a Stage")
     try:
-        return inspect_stage(cls)
+        kind = inspect_stage(cls)
+        refuse_construction(kind)
     except Refused as refusal:
         raise Refused(f"{place}: {refusal}") from None
+    return kind
 
 
 # ---------------------------------------------------------------------------------------------- settings

@@ -27,6 +27,8 @@ class Moody(Stage):
         moods: tuple[Literal["glad", "grim"], ...] = ()
         pause: float | Literal["auto"] = "auto"
 
+    def __init__(self, config: Config) -> None: ...
+
     def on_start(self) -> None: ...
 
 

@@ -25,6 +25,9 @@ class Teller(Stage):
     class Config:
         words: Path = Path("words.txt")
 
+    def __init__(self, config: Config) -> None:
+        pass
+
     def on_start(self) -> Finished:
         return Finished(code=0, reason="told")
 """

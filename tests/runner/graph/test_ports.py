@@ -1,11 +1,14 @@
 """Ports come from annotations, and a stage that breaks the contract is told where."""
 
+import functools
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import pytest
 
 from runner.contract import Context, Message, Refused, Stage, Struct
-from runner.graph.ports import inspect_stage, port_name
+from runner.graph.ports import inspect_stage, port_name, refuse_construction
 from tests.runner.common.toys import Account, Add, Answer, Collect, Double, Gatherer, Number, Piece, Total, Worker
 
 
@@ -116,9 +119,54 @@ class TakesSet(Stage):
     def on_labels(self, labels: Labels) -> None: ...
 
 
+class AnAttribute(Stage):
+    on_air = False
+
+
+class AProperty(Stage):
+    @property
+    def on_number(self) -> None: ...
+
+
+class AStaticMethod(Stage):
+    @staticmethod
+    def on_number(number: Number) -> None: ...
+
+
+class AnObject(Stage):
+    on_number = functools.partial(print)
+
+
+class Async(Stage):
+    async def on_number(self, number: Number) -> None: ...
+
+
+class Variadic(Stage):
+    def on_number(self, *number: Number) -> None: ...
+
+
+class ByPosition(Stage):
+    def on_number(self, number: Number, /) -> None: ...
+
+
+class StatefulDevice(Stage):
+    device = True
+    stateful = True
+
+    def on_number(self, number: Number) -> None: ...
+
+
 @pytest.mark.parametrize(
     ("cls", "message"),
     [
+        (AnAttribute, r"AnAttribute.on_air: is of type bool and no method; valid: def on_air\(self, ...\), or another"),
+        (AProperty, "AProperty.on_number: is of type property and no method; valid"),
+        (AStaticMethod, "AStaticMethod.on_number: is of type staticmethod and no method; valid"),
+        (AnObject, "AnObject.on_number: is of type partial and no method; valid"),
+        (Async, "Async.on_number: is async, and nobody would await it; valid"),
+        (Variadic, r"Variadic.on_number\(number\): is variadic positional, and messages are given by name"),
+        (ByPosition, r"ByPosition.on_number\(number\): is positional-only, and messages are given by name"),
+        (StatefulDevice, "StatefulDevice: is a device and stateful; valid: one of both, for its past lies outside"),
         (EmitsSet, "EmitsSet: Labels.labels.tags: a set has no order; valid: tuple"),
         (TakesSet, "TakesSet: Labels.labels.tags: a set has no order; valid: tuple"),
         (NoAnnotation, r"NoAnnotation.on_number\(number\): has no annotation"),
@@ -140,3 +188,37 @@ class TakesSet(Stage):
 def test_a_broken_contract_is_named(cls: type[Stage], message: str):
     with pytest.raises(Refused, match=message):
         inspect_stage(cls)
+
+
+class Abstract(Stage, ABC):
+    def on_number(self, number: Number) -> None: ...
+
+    @abstractmethod
+    def double(self) -> None: ...
+
+
+class NeedsTwo(Stage):
+    def __init__(self, port: int, host: str) -> None: ...
+
+    def on_number(self, number: Number) -> None: ...
+
+
+class LeavesSettings(Stage):
+    @dataclass(frozen=True)
+    class Config:
+        port: int = 1
+
+    def on_number(self, number: Number) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (Abstract, "Abstract: is abstract, it has no double"),
+        (NeedsTwo, "NeedsTwo.__init__: missing a required argument: 'port'; valid: def __init__.self.$"),
+        (LeavesSettings, "LeavesSettings.__init__: too many .* arguments; valid: def __init__.self, config: Config.$"),
+    ],
+)
+def test_what_no_graph_could_construct_is_named(cls: type[Stage], message: str):
+    with pytest.raises(Refused, match=message):
+        refuse_construction(inspect_stage(cls))
