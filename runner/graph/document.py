@@ -1,6 +1,7 @@
 """A graph file as it was written: values, the line of each, and what ``--set`` changed."""
 
 import difflib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,6 +82,12 @@ class _Loader(yaml.SafeLoader):
         if isinstance(value, str):
             value.encode()
         return value
+
+
+# As YAML 1.2 has them, and everybody else: 1e-3, 1.5e3.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"), list("-+.0123456789")
+)
 
 
 def read_yaml(text: str) -> Any:

@@ -269,6 +269,14 @@ def test_settings_have_yaml_types(tmp_path: Path):
     assert (graph.seed, graph.nodes["worker"].replicas) == (11, 3)
 
 
+@pytest.mark.parametrize(("text", "value"), [("1e-3", 1e-3), ("1.5e3", 1.5e3), ("-.1E+2", -0.1e2), ("7e22", 7e22)])
+def test_a_number_may_have_an_exponent(tmp_path: Path, text: str, value: float):
+    written = load(tmp_path, OUT, old="toys:Counter\n", new=f"toys:Counter\n    config: {{period: {text}}}\n")
+    for graph in (written, load(tmp_path, OUT, f"counter.period={text}")):
+        assert graph.nodes["counter"].config.period == value
+        assert graph_from_json(graph_to_json(graph)).nodes["counter"].config.period == value
+
+
 def test_paths_are_relative_to_where_they_were_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     shell = tmp_path / "shell"
     shell.mkdir()
