@@ -6,6 +6,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING as NONE
 from dataclasses import fields, is_dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
@@ -261,7 +263,8 @@ def _resolve_settings(document: Document, entries: Mapping[str, StageEntry], typ
     """Makes paths absolute, fills ``${stage.key}`` in and refuses what is still missing."""
     _absolute_paths(document, entries, types)
     settings = [(name, key) for name, entry in entries.items() for key in entry.config]
-    _collect(lambda keys: _fill_in(document, entries, keys), settings)
+    defaults = {keys: value for name, kind in types.items() for keys, value in _defaults(name, kind.config)}
+    _collect(lambda keys: _fill_in(document, entries, defaults, keys), settings)
     _absolute_paths(document, entries, types)
 
 
@@ -279,7 +282,17 @@ def _path_settings(config: type[Any] | None) -> set[str]:
     return {name for name, hint in hints.items() if hint is Path or Path in get_args(hint)}
 
 
-def _fill_in(document: Document, entries: Mapping[str, StageEntry], *chain: Keys) -> Any:
+def _defaults(stage: str, config: type[Any] | None) -> Iterator[tuple[str, Any]]:
+    """The values, by ``stage.key``, of settings that need not be written; those of groups too."""
+    for one in fields(config) if config else ():
+        value = one.default if one.default_factory is NONE else one.default_factory()
+        if value is not NONE:
+            values = {one.name: msgspec.to_builtins(value, enc_hook=str)}
+            for keys in _within(values, stage):
+                yield ".".join(map(str, keys)), reduce(getitem, keys[1:], values)
+
+
+def _fill_in(document: Document, entries: Mapping[str, StageEntry], defaults: Mapping[str, Any], *chain: Keys) -> Any:
     """Puts what a setting refers to in its place, and the same there first; ``chain`` leads from one to the next.
 
     A group of settings is filled in key by key.
@@ -291,7 +304,7 @@ def _fill_in(document: Document, entries: Mapping[str, StageEntry], *chain: Keys
     value = values[key]
     if isinstance(value, dict):
         for inner in value:
-            _fill_in(document, entries, *chain, (*chain[-1], inner))
+            _fill_in(document, entries, defaults, *chain, (*chain[-1], inner))
         return value
     place = document.place("stages", name, "config", *map(str, (*groups, key)))
     if value == MISSING:
@@ -301,9 +314,14 @@ def _fill_in(document: Document, entries: Mapping[str, StageEntry], *chain: Keys
         settings = (keys for name, entry in entries.items() for keys in _within(entry.config, name))
         valid = {".".join(map(str, keys)): keys for keys in settings}
         target = valid.get(match[1])
-        if target is None or target in chain:
-            raise Refused(f"{place}: no setting {match[1]!r} to fill in{suggest(match[1], valid)}")
-        return _fill_in(document, entries, *chain, target)
+        if target in chain:
+            way = " -> ".join(".".join(map(str, keys)) for keys in (*chain[chain.index(target) :], target))
+            raise Refused(f"{place}: {match[0]} refers to itself: {way}")
+        if target is not None:
+            return _fill_in(document, entries, defaults, *chain, target)
+        if match[1] not in defaults:
+            raise Refused(f"{place}: no setting {match[1]!r} to fill in{suggest(match[1], {*valid, *defaults})}")
+        return defaults[match[1]]
 
     if isinstance(value, str):
         whole = re.fullmatch(REFERENCE, value)

@@ -1,6 +1,7 @@
 """Graph files are checked to the last key, each mistake in one line with its place and the valid choices."""
 
 import json
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import jsonschema
@@ -119,6 +120,27 @@ def test_a_mistake_in_the_file_is_one_line(tmp_path: Path, old: str, new: str, m
     with pytest.raises(Refused, match=message) as caught:
         load(tmp_path, OUT, old=old, new=new)
     assert "\n" not in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Inner:
+    er: float = 0.5
+
+
+class Deep(Stage):
+    """Has a group of settings."""
+
+    @dataclass(frozen=True)
+    class Config:
+        deep: Inner = field(default_factory=Inner)
+
+    def __init__(self, config: Config) -> None: ...
+
+    def on_start(self) -> None: ...
+
+
+OLD = "stages:\n"
+DEEP = f"stages:\n  account: {{stage: '{__name__}:Deep'}}\n"
 
 
 class Alone(Stage):
@@ -294,8 +316,32 @@ def test_settings_fill_each_other_in(tmp_path: Path):
 def test_settings_fill_each_other_in_whatever_their_order(tmp_path: Path):
     chain = ("counter.count=${splitter.parts}", "splitter.parts=${worker.seconds}")
     assert load(tmp_path, OUT, *chain, "worker.seconds=3").nodes["counter"].config.count == 3
-    with pytest.raises(Refused, match=r"^--set worker.seconds: no setting 'counter.count' to fill in"):
-        load(tmp_path, OUT, *chain, "worker.seconds=${counter.count}")
+
+
+def test_a_setting_that_is_not_written_fills_others_in_with_its_default(tmp_path: Path):
+    graph = load(
+        tmp_path, OUT, "counter.count=${splitter.parts}", "worker.seconds=${account.deep.er}", old=OLD, new=DEEP
+    )
+    assert (graph.nodes["counter"].config.count, graph.nodes["worker"].config.seconds) == (4, 0.5)
+    with pytest.raises(
+        Refused, match=r"no setting 'splitter.prts' to fill in; did you mean 'splitter.parts'\? valid: "
+    ):
+        load(tmp_path, OUT, "counter.count=${splitter.prts}")
+
+
+def test_a_setting_that_refers_to_itself_shows_the_way(tmp_path: Path):
+    with pytest.raises(
+        Refused, match=r"^--set counter.count: \${counter.count} refers to itself: counter.count -> count"
+    ):
+        load(tmp_path, OUT, "counter.count=${counter.count}")
+    way = "counter.count -> splitter.parts -> worker.seconds -> counter.count"
+    settings = (
+        "counter.count=${splitter.parts}",
+        "splitter.parts=${worker.seconds}",
+        "worker.seconds=${counter.count}",
+    )
+    with pytest.raises(Refused, match=rf"^--set worker.seconds: \${{counter.count}} refers to itself: {way}"):
+        load(tmp_path, OUT, *settings)
 
 
 def test_json_is_read_back_as_the_same_graph(tmp_path: Path):
