@@ -152,7 +152,7 @@ def file_hashes(graph: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of everything that a setting of the graph names: files, folders with all that is in them, and YAML files
     with the files they name, for example the catalogue with its meshes."""
     texts = {text for stage in graph["stages"].values() for text in _texts(stage.get("config", {}))}
-    parts = {text: _parts(locate(Path(text), Path())) for text in sorted(texts)}
+    parts = {text: _parts(locate(Path(text), Path())) for text in sorted(texts) if text}
     return {text: _hash(files) for text, files in parts.items() if files}
 
 

@@ -94,3 +94,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason():
 
 def test_a_slash_is_a_word_and_not_the_whole_machine():
     assert provenance.file_hashes({"stages": {"camera": {"config": {"namespace": "/"}}}}) == {}
+
+
+def test_a_text_that_is_empty_is_not_the_working_folder():
+    assert provenance.file_hashes({"stages": {"camera": {"config": {"namespace": ""}}}}) == {}
