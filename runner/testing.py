@@ -146,9 +146,14 @@ class Run:
 
     @property
     def recording(self) -> Path:
-        """The file that was recorded."""
-        (path,) = self.folder.glob("*.mcap")
-        return path
+        """The file that was recorded; raises LookupError where there is none or several."""
+        found = sorted(self.folder.glob("*.mcap"))
+        if not found:
+            raise LookupError(f"{self.folder}: no recording; it printed:\n{self.output}")
+        if len(found) > 1:
+            names = ", ".join(path.name for path in found)
+            raise LookupError(f"{self.folder}: several recordings, {names}; valid: a folder for each run")
+        return found[0]
 
     def messages(self, kind: type[M]) -> list[M]:
         """Every recorded message of a class, by port and number."""

@@ -201,6 +201,17 @@ def test_a_graph_runs_and_its_messages_are_there(tmp_path: Path):
     assert Recording(run.recording).verdict.complete
 
 
+def test_a_run_without_a_recording_of_its_own_says_why(tmp_path: Path):
+    run = run_graph("name: nothing", folder=tmp_path)
+    assert run.code == 2
+    with pytest.raises(LookupError, match=r": no recording; it printed:\n.*: stages: expected a mapping"):
+        run.messages(Double)
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).touch()
+    with pytest.raises(LookupError, match=r": several recordings, a\.mcap, b\.mcap; valid: a folder for each run$"):
+        print(run.recording)
+
+
 TEXT = """
 name: waiting
 stages:
