@@ -33,11 +33,14 @@ def portable_name(path: Path) -> str | None:
 def find_graph(path: Path) -> Path:
     """The file itself where there is one, else the graph of that name in an installed package.
 
-    Raises Refused where a bare name is neither.
+    Raises Refused where a bare name is neither, or a folder.
     """
     if path.suffix or len(path.parts) != 1 or (path.exists() and not path.is_dir()):
         return locate(path, Path())
     graphs = packaged_graphs()
+    if path.name not in graphs and path.is_dir():
+        files = ", ".join(sorted(str(file) for file in path.glob("*.yaml")))
+        raise Refused(f"{path}: is a folder; valid: {files or 'a graph file'}")
     if path.name not in graphs:
         raise Refused(f"{path}: no such file, and no graph of an installed package{suggest(path.name, graphs)}")
     return graphs[path.name]

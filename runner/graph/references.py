@@ -103,9 +103,12 @@ def _extra(module_name: str) -> str:
 def _elsewhere(module_name: str) -> str:
     """What the missing module may be instead or, where even its package is missing, what to do."""
     top = module_name.partition(".")[0]
-    if find(top):
-        return suggest(module_name, _modules_beside(module_name))
-    return f": {top} is neither in {Path.cwd()} nor installed; run this in the folder that has it, or install it"
+    there = "run this in the folder that has it, or install it"
+    if (spec := find(top)) is None:
+        return f": {top} is neither in {Path.cwd()} nor installed; {there}"
+    beside = suggest(module_name, _modules_beside(module_name))
+    folder = next(iter(spec.submodule_search_locations or ()), "") if spec.origin is None else ""
+    return f"{beside}; if {folder} is not the package {top} that is meant, {there}" if folder else beside
 
 
 def _modules_beside(module_name: str) -> list[str]:

@@ -12,6 +12,7 @@ from runner.contract import Refused
 from runner.graph.graph import graph_to_json
 from runner.graph.packaged import find_graph, locate, portable_name
 from runner.graph.reading import graph_from_json, load_graph, node_from_entry
+from runner.graph.references import load_class
 from runner.recording.provenance import file_hashes, portable
 from runner.testing import finish, runner
 
@@ -89,6 +90,25 @@ def test_a_graph_is_found_by_its_name(package: Path, tmp_path: Path, capsys: pyt
     Path("told").write_text("name: [")
     assert main(["check", "told"]) == 2
     assert "not YAML" in capsys.readouterr().err
+
+
+def test_a_folder_is_no_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "jobs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Refused, match=r"^jobs: is a folder; valid: a graph file$"):
+        find_graph(Path("jobs"))
+    (tmp_path / "jobs/day.yaml").touch()
+    with pytest.raises(Refused, match=r"^jobs: is a folder; valid: jobs/day\.yaml$"):
+        find_graph(Path("jobs/"))
+
+
+def test_a_folder_around_a_package_is_not_that_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "outer/outer").mkdir(parents=True)
+    (tmp_path / "outer/outer/__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    text = rf"valid: outer\.outer; if {tmp_path}/outer is not the package outer that is meant, run this in the folder"
+    with pytest.raises(Refused, match=f"no module 'outer.thermometer'; .* {text} that has it, or install it$"):
+        load_class("outer.thermometer:Stage", "here")
 
 
 def test_a_setting_of_a_packaged_graph_is_resolved_and_travels(package: Path, tmp_path: Path):
