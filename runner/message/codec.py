@@ -242,6 +242,21 @@ def _array(name: str, shape: list[Any], data: bytes | memoryview) -> np.ndarray:
     return np.ndarray(shape, dtype, buffer=data)
 
 
+def array_of(value: Any, spec: Spec) -> np.ndarray:
+    """The array that nested lists of numbers say; raises ValueError where it is not what a field declares."""
+    given = np.array(value)  # raises ValueError where the lists differ in length
+    array = given.astype(DTYPES[spec.dtype]) if given.dtype.kind in "biuf" else given
+    if array.dtype.kind != "f" and not np.array_equal(array, given):
+        raise ValueError(f"expected {spec.dtype}, got {given.dtype}")
+    _check_array(array, spec)
+    return array
+
+
+def shown(spec: Spec) -> str:
+    """What an array must be, for people: ``float64 (3,)``."""
+    return f"{spec.dtype} ({', '.join(map(str, spec.shape))})"
+
+
 def _check_array(array: np.ndarray, spec: Spec) -> None:
     """Raises ValueError unless the array is what its field declares."""
     _check_size(array.nbytes)

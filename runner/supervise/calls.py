@@ -7,9 +7,11 @@ import inspect
 import itertools
 import textwrap
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from enum import Enum, EnumType
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin
 
 import msgspec
 
@@ -17,7 +19,7 @@ from runner.contract import Command, Level, Refused
 from runner.graph.document import read_yaml, suggest
 from runner.graph.graph import Graph, Node, command_port
 from runner.graph.ports import port_name
-from runner.message.codec import CodecError, LogLine, Step
+from runner.message.codec import CodecError, LogLine, Step, array_of, shown, spec_of
 from runner.message.ids import MessageId, Recent
 
 KEPT = 100
@@ -230,17 +232,31 @@ def _find(graph: Graph, request: CallRequest) -> type[Command]:
 
 def _value(place: str, name: str, kind: Any, text: str) -> Any:
     """The text itself where that fits the type, else what YAML makes of it."""
+    specs = [spec for part in _flat(kind) if (spec := spec_of(part)) is not None]
+
+    def array(_: type, value: Any) -> Any:
+        if len(specs) != 1:  # inside a struct, or of several kinds
+            raise ValueError("an array cannot be typed here")
+        return array_of(value, specs[0])
+
     try:
-        return msgspec.convert(text, kind, strict=False)
+        return msgspec.convert(text, kind, strict=False, dec_hook=array)
     except msgspec.ValidationError as error:
         reason = str(error)
     try:
-        return msgspec.convert(read_yaml(text), kind)
+        return msgspec.convert(read_yaml(text), kind, dec_hook=array)
     except msgspec.ValidationError as error:
         reason = str(error)
     except ValueError:  # nothing that YAML knows
         pass
     raise Refused(f"{place}: {name}={text}: {reason.partition(' - at `')[0]}; valid: {_spelled(kind)}")
+
+
+def _flat(kind: Any) -> Iterator[Any]:
+    yield kind
+    if get_origin(kind) is not Literal:
+        for argument in get_args(kind):
+            yield from _flat(argument)
 
 
 def _command_type(node: Node, name: str, kind: type[Command]) -> CommandType:
@@ -260,11 +276,21 @@ def _default(info: msgspec.structs.FieldInfo) -> str | None:
 
 
 def _spelled(kind: Any) -> str:
-    """A type as a person would say it: the words of a choice, else its name."""
-    found = msgspec.inspect.type_info(kind)
-    if isinstance(found, msgspec.inspect.LiteralType):
-        return " | ".join(map(str, found.values))
-    return getattr(kind, "__name__", str(kind))
+    """A type as a person would say it: the words of a choice, what is inside a container, else its name."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if (spec := spec_of(kind)) is not None:
+        return shown(spec)
+    if origin is Annotated:
+        return _spelled(arguments[0])
+    if origin is Literal:
+        return " | ".join(map(str, arguments))
+    if origin in (Union, UnionType):
+        return " | ".join(map(_spelled, arguments))
+    if isinstance(kind, EnumType):
+        return " | ".join(str(one.value) for one in cast("type[Enum]", kind))
+    inside = ", ".join("..." if argument is ... else _spelled(argument) for argument in arguments)
+    name = "None" if kind is NoneType else getattr(origin or kind, "__name__", str(kind))
+    return f"{name}[{inside}]" if inside else name
 
 
 def _field_texts(kind: type[Command]) -> dict[str, str]:

@@ -12,17 +12,19 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from enum import Enum
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from runner.cli.completion import Shell, script
 from runner.cli.doctor import examine, examine_graph
 from runner.cli.main import main
-from runner.contract import Refused
+from runner.contract import Command, Refused, Spec, Stage
 from runner.graph.graph import QUEUE
 from runner.graph.reading import load_graph
 from runner.inspect.echo import lines_of
@@ -30,7 +32,7 @@ from runner.live.live import Header, Live
 from runner.live.tables import rate_text, show_lines, show_progress
 from runner.message.codec import Envelope, LogLine, Step, open_envelope, pack, unpack
 from runner.recording.recording import Recording
-from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress
+from runner.supervise.calls import CallQuestion, CallRequest, Calls, Progress, read_command
 from runner.supervise.registry import Entry, Registration, find_run, runs
 from runner.testing import read_until, start_graph
 from runner.transport.bus import Bus
@@ -269,6 +271,57 @@ def test_what_breaks_the_type_of_a_command_is_refused(
     assert published == []
 
 
+class Pace(Enum):
+    SLOW = "slow"
+    FAST = "fast"
+
+
+class Move(Command, frozen=True, kw_only=True):
+    to: Annotated[NDArray[np.float64], Spec("float64", (3,))] | None = None
+    cells: Annotated[NDArray[np.uint8], Spec("uint8", ("N", 2))] | None = None
+    pace: Pace = Pace.SLOW
+    past: tuple[tuple[int, str], ...] = ()
+
+
+class Mover(Stage):
+    def on_move(self, move: Move) -> None: ...
+
+
+def test_arrays_of_a_command_are_typed_as_lists() -> None:
+    move = cast(
+        "Move", read_command("mover move", Move, {"to": "[1, 2.5, -1e-3]", "cells": "[[0, 255]]", "pace": "fast"})
+    )
+    assert move.to is not None and move.cells is not None
+    assert (move.to.dtype, move.to.tolist()) == (np.float64, [1.0, 2.5, -1e-3])
+    assert (move.cells.dtype, move.cells.tolist(), move.pace) == (np.uint8, [[0, 255]], Pace.FAST)
+    assert read_command("mover move", Move, {"to": "null"}) == Move()
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "reason"),
+    [
+        ("to", "[1, 2]", "expected shape (3), got (2); valid: float64 (3) | None"),
+        ("to", "[[1], [2, 3]]", "setting an array element with a sequence"),
+        ("to", "[a, b, c]", "expected float64, got <U1; valid: float64 (3) | None"),
+        ("cells", "[[0, 256]]", "expected uint8, got int64; valid: uint8 (N, 2) | None"),
+        ("cells", "[[0, 1.5]]", "expected uint8, got float64; valid: uint8 (N, 2) | None"),
+        ("pace", "FAST", "Invalid enum value 'FAST'; valid: slow | fast"),
+        ("past", "[[1, 2]]", "Expected `str`, got `int`; valid: tuple[tuple[int, str], ...]"),
+    ],
+)
+def test_what_is_no_such_array_or_choice_is_refused_with_what_is(field: str, text: str, reason: str) -> None:
+    with pytest.raises(Refused, match=f"^{re.escape(f'mover move: {field}={text}: {reason}')}"):
+        read_command("mover move", Move, {field: text})
+
+
+def test_a_command_says_what_its_fields_take(tmp_path: Path) -> None:
+    path = tmp_path / "mover.yaml"
+    path.write_text(f"name: mover\nstages: {{mover: {{stage: '{__name__}:Mover'}}}}\n")
+    (move,) = Calls(load_graph(path), lambda *_: "").types()
+    kinds = ["float64 (3) | None", "uint8 (N, 2) | None", "slow | fast", "tuple[tuple[int, str], ...]"]
+    assert [one.type for one in move.fields] == kinds
+
+
 def test_commands_describe_themselves() -> None:
     add, collect = Calls(load_graph(ACCOUNT), lambda *_: None).types()
     assert (add.stage, add.name, add.text, add.answers) == ("account", "add", "Adds to the account.", ())
@@ -276,7 +329,7 @@ def test_commands_describe_themselves() -> None:
         ("amount", "int", None, "May be negative."),
         ("mood", "glad | sad", "'glad'", ""),
         ("note", "str", "''", ""),
-        ("tags", "list", "[]", ""),
+        ("tags", "list[str]", "[]", ""),
     ]
     assert collect.answers == ("sum",)
 
