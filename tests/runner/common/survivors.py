@@ -254,6 +254,9 @@ class Preparing(Stage):
 
     Config = Mortality
 
+    def __init__(self, config: Mortality):
+        del config
+
     @classmethod
     def prepare(cls, config: Mortality) -> None:
         (config.marks / "prepares").touch()
