@@ -34,6 +34,7 @@ from runner.hosts.head import (
 from runner.message.packet import Packet, Process
 from runner.process.children import Descendants, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer, Interrupted
+from runner.process.forks import EXIT_FAILED
 from runner.terminal import Terminal
 from runner.transport.bus import Bus
 from runner.transport.session import private
@@ -43,7 +44,7 @@ GRACE_SECONDS = 2.0
 TICK_SECONDS = 0.05
 TAIL_LINES = 40
 GONE = 1
-"""Exit status where the head has gone or cannot be reached, and stands for that of a process that cannot be started."""
+"""Exit status where the head has gone or cannot be reached."""
 
 
 @dataclass(slots=True)
@@ -147,7 +148,7 @@ class Agent:
                         except Interrupted:
                             self._report(Ended(process, -signal.SIGKILL, ""))
                         except OSError as error:
-                            self._report(Ended(process, GONE, f"it cannot be started: {error}\n"))
+                            self._report(Ended(process, EXIT_FAILED, f"it cannot be started: {error}\n"))
                     case Signal() as order:
                         self._signal(order)
                     case end:

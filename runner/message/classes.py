@@ -11,11 +11,14 @@ from runner.message.codec import DTYPES, MAX_DIMENSIONS, describe, fields_of, is
 
 def refuse_class(kind: type[Message]) -> None:
     """Raises Refused, naming field and reason, where messages of a class could not be sent, read or described."""
-    _refuse_type(kind.__name__, kind, set())
-    _refuse_undescribed(kind.__name__, kind)
+    undescribed = _why_undescribed(kind)
+    _refuse_type(kind.__name__, kind, set(), by_field=bool(undescribed))
+    if undescribed:
+        raise Refused(f"{kind.__name__}: {undescribed}")
 
 
-def _refuse_type(place: str, annotation: Any, known: set[Any]) -> None:
+def _refuse_type(place: str, annotation: Any, known: set[Any], *, by_field: bool) -> None:
+    """With ``by_field`` each field is described alone: something in the class cannot be."""
     kind = get_origin(annotation) or annotation
     if (spec := spec_of(annotation)) is not None:
         if reason := _why_no_array(get_args(annotation)[0], spec):
@@ -30,10 +33,11 @@ def _refuse_type(place: str, annotation: Any, known: set[Any]) -> None:
     if is_record(kind) and kind not in known:
         known.add(kind)
         for name, hint in _fields(place, kind).items():
-            _refuse_type(f"{place}.{name}", hint, known)
-            _refuse_undescribed(f"{place}.{name}", hint)
+            _refuse_type(f"{place}.{name}", hint, known, by_field=by_field)
+            if by_field and (reason := _why_undescribed(hint)):
+                raise Refused(f"{place}.{name}: {reason}")
     for argument in get_args(annotation):
-        _refuse_type(place, argument, known)
+        _refuse_type(place, argument, known, by_field=by_field)
 
 
 def _fields(place: str, kind: Any) -> dict[str, Any]:
@@ -43,14 +47,15 @@ def _fields(place: str, kind: Any) -> dict[str, Any]:
         raise Refused(f"{place}: an annotation cannot be resolved: {error}") from None
 
 
-def _refuse_undescribed(place: str, annotation: Any) -> None:
-    """Refuses what msgspec does not take: other classes, unions that cannot be told apart, defaults of other types."""
+def _why_undescribed(annotation: Any) -> str:
+    """Why msgspec does not take a type, empty where it does: it holds another class, a union that cannot be told
+    apart, a default of another type."""
     try:
         describe(annotation)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, NameError) as error:
         reason = str(error).rpartition("\n")[2]
-        valid = "; valid: numbers, texts, tuples, arrays, Structs" if reason.startswith("type ") else ""
-        raise Refused(f"{place}: {reason}{valid}") from None
+        return reason + ("; valid: numbers, texts, tuples, arrays, Structs" if reason.startswith("type ") else "")
+    return ""
 
 
 def _why_no_array(kind: Any, spec: Spec) -> str:
