@@ -283,13 +283,14 @@ class StageProcess:
         self._present = record
         self._busy.append(ready.handler.name)
         try:
-            while not record.ended:
-                for draft in record.timed(emissions):
-                    self._emit(draft)
-                    if self._stopping.is_set():
-                        raise Stopped
-                if not record.ended:
-                    self._let_others_in()
+            with contextlib.closing(emissions):  # a handler that is stopped may fail at that
+                while not record.ended:
+                    for draft in record.timed(emissions):
+                        self._emit(draft)
+                        if self._stopping.is_set():
+                            raise Stopped
+                    if not record.ended:
+                        self._let_others_in()
         except Stopped:
             record.outcome = "stopped"
         except Refused as refusal:
@@ -299,7 +300,6 @@ class StageProcess:
             record.error = _summary(error)
             raise
         finally:
-            emissions.close()
             self._busy.pop()
             self._present = outer
             self._journal(record)

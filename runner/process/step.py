@@ -1,5 +1,6 @@
 """Executes one step of one stage; the same code runs live and in a replay."""
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
@@ -124,13 +125,14 @@ class Executor:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
         emitted = _Emitted()
-        for message in _messages(getattr(self._stage, handler.name)(**arguments)):
-            if message is not None:
-                yield self._draft(message, driver, causes, context.time_ns, emitted)
-            elif self._node.type.cls.device:
-                yield None
-            else:
-                raise BrokenContract("yielded None, which lets others have their turn; only a device may")
+        with contextlib.closing(_messages(getattr(self._stage, handler.name)(**arguments))) as messages:
+            for message in messages:
+                if message is not None:
+                    yield self._draft(message, driver, causes, context.time_ns, emitted)
+                elif self._node.type.cls.device:
+                    yield None
+                else:
+                    raise BrokenContract("yielded None, which lets others have their turn; only a device may")
 
     def advance(self, handler: Handler, clock: Callable[[], int]) -> Iterator[Draft | None]:
         """Yields the messages of a device's source, each a step of its own at the clock's time; None as it does."""
@@ -220,7 +222,7 @@ def arguments_of(arrivals: Iterable[Arrival]) -> dict[str, Any]:
     return arguments
 
 
-def _messages(result: Message | Iterable[Message | None] | None) -> Iterator[Message | None]:
+def _messages(result: Message | Iterable[Message | None] | None) -> Generator[Message | None]:
     """What a handler returned, as an iterator."""
     if isinstance(result, Message):
         yield result

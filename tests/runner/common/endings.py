@@ -142,5 +142,7 @@ class TooLate(Stage):
 
     def on_number(self, number: Number) -> Iterator[Double | Finished]:
         yield Double(value=2 * number.value)
-        yield Finished(code=0, reason="first")
-        raise ValueError("too late")
+        try:
+            yield Finished(code=0, reason="first")
+        finally:  # whether it goes on or is stopped there
+            raise ValueError("too late")
