@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass
 from functools import cache, cached_property
+from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from runner.contract import Command, Context, Message, Part, Refused, Stage, name_of
@@ -30,6 +31,8 @@ class Handler:
     """Name of the parameter that receives the step's context."""
     outputs: tuple[type[Message], ...]
     """What its result's annotation announces."""
+    optional: bool
+    """It may return None: its annotation says so."""
 
     @cached_property
     def is_command(self) -> bool:
@@ -137,7 +140,8 @@ def _handler(cls: type[Stage], name: str) -> Handler:
         else:
             inputs.append(_input_port(cls, name, parameter, annotation))
     _refuse_inputs(cls, name, inputs)
-    return Handler(name, tuple(inputs), context, tuple(_message_types(result)))
+    optional = NoneType in (result, *get_args(result))
+    return Handler(name, tuple(inputs), context, tuple(_message_types(result)), optional)
 
 
 def _hints(cls: type[Stage], name: str) -> dict[str, Any]:

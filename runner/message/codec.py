@@ -565,7 +565,10 @@ def _codec_error(type_name: str, error: Exception) -> CodecError:
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON Schema of the map that carries one message type: the envelope with its body."""
     (place,), definitions = describe(kind)
-    body = definitions.pop(place["$ref"].rpartition("/")[2])
+    name = place["$ref"].rpartition("/")[2]
+    body = definitions[name]
+    if repr(place["$ref"]) not in repr(definitions):  # it does not hold itself
+        del definitions[name]
     (schema,) = msgspec.json.schema_components([Envelope])[1].values()
     schema["title"], schema["properties"]["body"] = name_of(kind), body
     return {**schema, "$defs": definitions} if definitions else schema

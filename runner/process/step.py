@@ -125,7 +125,10 @@ class Executor:
             arguments[handler.context] = context
         causes = tuple(arrival.envelope.id for arrival in arrivals)
         emitted = _Emitted()
-        with contextlib.closing(_messages(getattr(self._stage, handler.name)(**arguments))) as messages:
+        result = getattr(self._stage, handler.name)(**arguments)
+        if result is None and not handler.optional:  # whoever waits for its answer would wait for ever
+            raise BrokenContract("returned None, which its annotation does not allow")
+        with contextlib.closing(_messages(result)) as messages:
             for message in messages:
                 if message is not None:
                     yield self._draft(message, driver, causes, context.time_ns, emitted)

@@ -272,7 +272,8 @@ def _command_type(node: Node, name: str, kind: type[Command]) -> CommandType:
 def _default(info: msgspec.structs.FieldInfo) -> str | None:
     if info.required:
         return None
-    return repr(info.default if info.default_factory is msgspec.NODEFAULT else info.default_factory())
+    default = info.default if info.default_factory is msgspec.NODEFAULT else info.default_factory()
+    return repr(default.value if isinstance(default, Enum) else default)
 
 
 def _spelled(kind: Any) -> str:

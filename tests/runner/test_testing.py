@@ -129,6 +129,8 @@ class Liar(Stage):
     """Breaks its word."""
 
     def on_number(self, number: Number) -> Total:
+        if number.value:
+            return None  # type: ignore[return-value]
         return Total(samples=np.zeros((2, 2)), last=False) if number.last else Number(value=1)  # type: ignore[return-value]
 
 
@@ -139,6 +141,8 @@ def test_errors_are_those_of_the_handler():
         run_stage(Account(), [Add(amount=0)])
     with pytest.raises(BrokenContract, match="emitted a Number; its annotations announce total"):
         run_stage(Liar(), [Number(value=0)])
+    with pytest.raises(BrokenContract, match=r"^returned None, which its annotation does not allow$"):
+        run_stage(Liar(), [Number(value=1)])
     with pytest.raises(CodecError, match=r"Total.*samples"):
         run_stage(Liar(), [Number(value=0, last=True)])
 

@@ -320,6 +320,7 @@ def test_a_command_says_what_its_fields_take(tmp_path: Path) -> None:
     (move,) = Calls(load_graph(path), lambda *_: "").types()
     kinds = ["float64 (3) | None", "uint8 (N, 2) | None", "slow | fast", "tuple[tuple[int, str], ...]"]
     assert [one.type for one in move.fields] == kinds
+    assert [one.default for one in move.fields] == ["None", "None", "'slow'", "()"]
 
 
 def test_commands_describe_themselves() -> None:

@@ -363,6 +363,11 @@ class Number(Message, frozen=True, kw_only=True):
     number: toys.Number
 
 
+class Branch(Message, frozen=True, kw_only=True):
+    name: str
+    twigs: "tuple[Branch, ...]" = ()
+
+
 def called(name: str, **fields: float) -> Message:
     """A message of a class with a name."""
     kinds = [(field, type(value)) for field, value in fields.items()]
@@ -372,11 +377,16 @@ def called(name: str, **fields: float) -> Message:
 
 @pytest.mark.parametrize(
     "message",
-    [Number(number=toys.Number(value=3)), called("Größe", höhe=0.5), called("Envelope", height=0.5)],
-    ids=["inside", "letters", "envelope"],
+    [
+        Number(number=toys.Number(value=3)),
+        called("Größe", höhe=0.5),
+        called("Envelope", height=0.5),
+        Branch(name="a", twigs=(Branch(name="b"),)),
+    ],
+    ids=["inside", "letters", "envelope", "itself"],
 )
-def test_any_class_name_has_a_schema(message: Message):
-    """Also one that a class inside has too, or the record around it."""
+def test_any_class_has_a_schema(message: Message):
+    """Also one that holds itself, or has the name of a class inside or of the record around it."""
     schema = codec.json_schema(type(message))
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(msgpack.unpackb(codec.pack(sealed(message))), schema)
