@@ -10,6 +10,7 @@ import queue
 import re
 import secrets
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from runner.hosts.head import (
     network_of,
 )
 from runner.message.packet import Packet, Process
-from runner.process.children import Descendants, Handle, behind, end_process, last_lines
+from runner.process.children import DEVICE_GRACE_SECONDS, Descendants, Handle, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer, Interrupted
 from runner.process.forks import EXIT_FAILED
 from runner.terminal import Terminal
@@ -40,7 +41,6 @@ from runner.transport.bus import Bus
 from runner.transport.session import private
 
 ASK_SECONDS = 15.0
-GRACE_SECONDS = 2.0
 TICK_SECONDS = 0.05
 TAIL_LINES = 40
 GONE = 1
@@ -208,8 +208,9 @@ class Agent:
         """Asks what is left to end, then kills it."""
         for child in self._children.values():
             child.handle.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + DEVICE_GRACE_SECONDS
         for child in self._children.values():
-            end_process(child.handle, GRACE_SECONDS)
+            end_process(child.handle, max(0.0, deadline - time.monotonic()))
         self._forks.close()
         if left := self._descendants.close():
             self._say(f"the stages {behind(left)}")

@@ -34,6 +34,8 @@ PARENT = "RUNNER_PARENT"
 """Names the variable that tells a child who started it."""
 DESCENT = "RUNNER_DESCENT"
 """Names the variable that tells of which processes of runs a process descends, in whatever session or group it is."""
+DEVICE_GRACE_SECONDS = 10.0
+"""What a device may take to come to rest before it is killed."""
 DESCENDANT_GRACE_SECONDS = 0.5
 """What a descendant that is asked to end gets to clean up before it is killed."""
 DEATH_SECONDS = 3.0

@@ -13,7 +13,7 @@ from runner.graph.graph import SUPERVISOR
 from runner.hosts.head import Hosts
 from runner.message.codec import Step
 from runner.message.packet import RECORDER, Process
-from runner.process.children import DUMP, behind, end_process, last_lines
+from runner.process.children import DEVICE_GRACE_SECONDS, DUMP, behind, end_process, last_lines
 from runner.process.fork_server import ForkServer
 from runner.process.health import Watch
 from runner.supervise.child import Child, Progress
@@ -22,9 +22,7 @@ from runner.supervise.status import ProcessStatus, Pulses
 from runner.terminal import Terminal
 
 STAGE_GRACE_SECONDS = 2.0
-"""What a stage may take to finish its step before it is killed."""
-DEVICE_GRACE_SECONDS = 10.0
-"""The same for a device, which comes to rest in it."""
+"""What a stage may take to finish its step before it is killed; a device may take longer."""
 SEEN_SECONDS = 0.5
 """How long it may take to hear that a process was ready that has died at once."""
 END_GRACE_SECONDS = 10.0

@@ -271,6 +271,19 @@ def test_hosts_end_with_their_head(parties, tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_a_device_comes_to_rest_where_its_head_has_gone(parties, tmp_path: Path):
+    graph = tmp_path / "moves.yaml"
+    graph.write_text(SUMS.replace("tests.runner.common.survivors:Adder", "tests.runner.common.endings:Mover"))
+    party = parties(on_loopback(), tmp_path, graph=graph)
+    party.start("head", f"adder.marks={tmp_path}")
+    party.start("worker1")
+    wait_until((tmp_path / "moves").exists)
+    party.hosts["head"].kill()
+    assert party.end("worker1").code == 1
+    assert (tmp_path / "rests").exists()
+
+
+@pytest.mark.slow
 def test_a_host_that_stands_still_does_not_keep_the_head_from_its_end(parties, tmp_path: Path):
     party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.6")
     before = read_until(party.hosts["head"], "sum")
