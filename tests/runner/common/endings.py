@@ -63,10 +63,12 @@ class Slow(Stage):
         subprocess.Popen(["sleep", "611"])
 
     def on_number(self, number: Number) -> Iterator[Double]:
-        yield Double(value=2 * number.value)
-        if number.last:
-            subprocess.run(["sleep", "0.8"], check=True)
-            (self._marks / "worked").touch()
+        try:
+            yield Double(value=2 * number.value)
+        finally:  # whether it goes on or is stopped there: the sink ends the graph
+            if number.last:
+                subprocess.run(["sleep", "0.8"], check=True)
+                (self._marks / "worked").touch()
 
     def close(self) -> None:
         self._helper.communicate("park\n")

@@ -55,7 +55,8 @@ def test_what_a_stage_has_started_works_until_the_stage_is_closed(tmp_path: Path
     assert processes_of(tmp_path) == []
     recording = Recording(ended.recording)
     assert recording.verdict.complete
-    assert {step.outcome for step in recording.steps if step.stage == "doubler"} == {"done"}
+    *before, last = [step.outcome for step in recording.steps if step.stage == "doubler" and step.handler]
+    assert (set(before), last in ("done", "stopped")) == ({"done"}, True)
 
 
 @pytest.mark.slow
