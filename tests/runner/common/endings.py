@@ -146,5 +146,6 @@ class TooLate(Stage):
         yield Double(value=2 * number.value)
         try:
             yield Finished(code=0, reason="first")
-        finally:  # whether it goes on or is stopped there
+        finally:  # whether it goes on or is stopped there, once the supervisor has heard that
+            time.sleep(0.3)
             raise ValueError("too late")

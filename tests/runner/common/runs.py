@@ -1,11 +1,14 @@
 """Starts graphs as a user does, and looks at what they leave."""
 
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from runner import testing
 from runner.testing import start_graph
+from runner.transport.bus import Bus
+from runner.transport.presence import Presence
 
 TOYS, DOUBLES, ALBUM, ACCOUNT = (
     Path(__file__).with_name(f"{name}.yaml") for name in ("toys", "doubles", "album", "account")
@@ -61,6 +64,13 @@ def meeting_of(gateway: str) -> str:
     own = Path(gateway.partition("/")[2])
     others = (path for path in own.parent.iterdir() if path != own and path.suffix != ".lock")
     return f"unixsock-stream/{min(others, key=lambda path: path.stat().st_ctime_ns)}"
+
+
+def wait_for_links(bus: Bus, *processes: tuple[str, int]) -> None:
+    """Waits until these, (stage, replica), hear what a bus publishes: a process announces itself once it listens."""
+    presence, deadline = Presence(), time.monotonic() + 60
+    bus.watch(presence.update)
+    assert presence.wait_for(processes, lambda: time.monotonic() > deadline)
 
 
 def processes_of(folder: Path) -> list[str]:

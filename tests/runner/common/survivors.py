@@ -267,7 +267,7 @@ class Preparing(Stage):
 
 
 class GatedCounter(Stage):
-    """Counts like the toy counter; the last number waits for a file."""
+    """Counts like the toy counter; one number, the last unless it is told which, waits for a file."""
 
     device = True
 
@@ -276,13 +276,14 @@ class GatedCounter(Stage):
         go: Path
         count: int = 5
         period: float = 0.0
+        waits: int = -1
 
     def __init__(self, config: Config):
         self._config = config
 
     def source(self, ctx: Context) -> Iterator[Number]:
         for value in range(self._config.count):
-            while value == self._config.count - 1 and not self._config.go.exists():
+            while value == self._config.waits % self._config.count and not self._config.go.exists():
                 time.sleep(0.01)
             yield Number(value=value, last=value == self._config.count - 1)
             time.sleep(self._config.period)

@@ -407,7 +407,8 @@ def test_an_answer_without_success_is_an_exit_status(capsys: pytest.CaptureFixtu
 
 def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) -> None:
     settings = ("counter.count=60", "counter.period=0.05", "worker.seconds=0.02", "worker.restarts=0")
-    run = Run(tmp_path, TOYS, f"sink.path={tmp_path / 'out.txt'}", *settings)
+    files = (f"sink.path={tmp_path / 'out.txt'}", f"counter.go={tmp_path / 'go'}")
+    run = Run(tmp_path, changed(TOYS, tmp_path, Counter="GatedCounter"), *files, *settings)
     with Live(run.entry) as live:
         with pytest.raises(Refused, match=r"no process 'worker'; did you mean 'worker.1'"):
             live.restart("worker")
@@ -415,6 +416,7 @@ def test_a_restart_in_order_loses_nothing_and_costs_no_budget(tmp_path: Path) ->
         assert re.fullmatch(r"worker.1 is back: process \d+, ready after \d+\.\d s", live.restart("worker.1"))
         worker = next(process for process in live.status().processes if process.name == "worker.1")
         assert (worker.restarts, worker.reason) == (1, "asked to restart")
+    (tmp_path / "go").touch()
     finished = run.finish()
     assert (finished.code, len(finished.result)) == (0, 60), finished.output
     recording = Recording(finished.recording)

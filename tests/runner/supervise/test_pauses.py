@@ -24,7 +24,8 @@ def test_a_pause_of_any_process_loses_nothing(tmp_path: Path, seconds: float):
     for victim, folder in folders.items():
         folder.mkdir()
         graphs[victim] = start(TOYS, folder, f"counter.count={COUNT}", "counter.period=0.2")
-        seen[victim] = read_until(graphs[victim], "processes are ready")
+    for victim, process in graphs.items():
+        seen[victim] = read_until(process, "processes are ready")
     time.sleep(1)
     pids = {victim: pid_of(folders[victim], name) if name else graphs[victim].pid for victim, name in VICTIMS.items()}
     for pid in pids.values():

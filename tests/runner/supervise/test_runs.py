@@ -15,7 +15,18 @@ from runner.recording.recording import Recording
 from runner.replay.replay import verify
 from runner.testing import read_until
 from runner.transport.bus import Bus
-from tests.runner.common.runs import DOUBLES, TOYS, Run, changed, finish, meeting_of, processes_of, run, start
+from tests.runner.common.runs import (
+    DOUBLES,
+    TOYS,
+    Run,
+    changed,
+    finish,
+    meeting_of,
+    processes_of,
+    run,
+    start,
+    wait_for_links,
+)
 
 
 @pytest.fixture(scope="module")
@@ -152,18 +163,20 @@ def test_children_die_with_their_supervisor(tmp_path: Path):
 
 
 def test_corrupt_bytes_are_refused_and_counted_and_the_process_lives_on(tmp_path: Path):
-    process = start(DOUBLES, tmp_path, "counter.count=40", "counter.period=0.05", "sink.count=40")
+    graph = changed(DOUBLES, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}")
     before = read_until(process, "processes are ready")
     match = re.search(r"run (\S+) on (\S+)", before)
     assert match is not None
     bus = Bus(match[1], meeting_of(match[2]))
-    time.sleep(0.5)
+    wait_for_links(bus, ("doubler", 0), ("counter", 0))
     for key in ("again/doubler/0/number", "j/doubler"):
-        time.sleep(0.2)
         bus.publish(key, b"\xc1garbage")
+        before += "" if f"{key}: message refused" in before else read_until(process, f"{key}: message refused")
+    (tmp_path / "go").touch()
     ended = finish(process, tmp_path, before)
     bus.close()
-    assert len(ended.result) == 40
+    assert len(ended.result) == 5
     assert "again/doubler/0/number: message refused (1 so far): Envelope: MessagePack data is malformed" in ended.output
     assert "j/doubler: message refused (1 so far): Journal" in ended.output
 

@@ -231,7 +231,10 @@ def test_a_successor_hears_what_every_replica_is_to_hear_though_another_one_has_
     assert recording.verdict.complete, recording.verdict
     steps = [step for step in recording.steps if step.stage == "worker" and step.outcome == "done"]
     heard = [(step.replica, id) for step in steps for port, id in step.consumed if port == "heard"]
-    assert len(heard) == len(set(heard)) == 120
+    ends = [(end.replica, end.left) for end in recording.ends if end.stage == "worker"]
+    left = [(replica, id) for replica, undone in ends for port, id in undone if port == "heard"]
+    assert {id for _, id in left} <= {"counter.number#59"}  # the end of the graph may come before one has heard it
+    assert len(heard) == len(set(heard)) and len({*heard, *left}) == 120
 
 
 @pytest.mark.parametrize("way", ["quit", "interrupt"])
@@ -309,9 +312,9 @@ def test_a_slow_consumer_of_the_latest_works_on_the_newest(tmp_path: Path):
 
 def test_a_graph_that_ends_before_a_successor_knows_what_is_left_lacks_nothing(tmp_path: Path):
     """It is to hear that once its publisher sends to it, which stands still."""
-    process = start(DOUBLES, tmp_path, *ENDLESS, "doubler.seconds=0.1")
+    process = start(DOUBLES, tmp_path, *ENDLESS, "doubler.seconds=2")
     before = read_until(process, "processes are ready")
-    wait_until((tmp_path / "out.txt").exists)
+    wait_until(lambda: "doubler.double#0" in Recording(next(tmp_path.glob("*.mcap"))).messages)
     os.kill(pid_of(tmp_path, "counter-0"), signal.SIGSTOP)
     os.kill(pid_of(tmp_path, "doubler-0"), signal.SIGKILL)
     before += read_until(process, "ready after")

@@ -5,7 +5,6 @@ import json
 import random
 import re
 import socket
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from runner.testing import read_until
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
-from tests.runner.common.runs import ALBUM, TOYS, changed, finish, meeting_of, processes_of, run, start
+from tests.runner.common.runs import ALBUM, TOYS, changed, finish, meeting_of, processes_of, run, start, wait_for_links
 from tests.runner.common.survivors import Picture
 from tests.runner.common.toys import Answer
 from tests.runner.common.waiting import wait_until
@@ -181,7 +180,7 @@ def test_what_is_wrong_is_named(tmp_path: Path):
     match = re.search(r"run (\S+) on (\S+)", before)
     assert match is not None
     stray = Bus(match[1], meeting_of(match[2]))
-    time.sleep(1)
+    wait_for_links(stray, ("gatherer", 0))
     for number, sealed in enumerate(bad.values()):
         stray.publish("again/gatherer/0/answers", pack(change(sealed, id=f"worker.answer#{1000 + number}")))
     before += read_until(process, "element type 'object6'")

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from runner.cli.main import main
+from runner.graph.reading import load_graph
 from runner.hosts.head import control
 from runner.message.codec import pack
 from runner.recording.recording import Recording
@@ -32,7 +33,8 @@ EXAMPLE = Path(__file__).parents[3] / "examples" / "listen.py"
 def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path: Path):
     address = public_address()
     graph = changed(TOYS, tmp_path, Counter="GatedCounter")
-    process = start(graph, tmp_path, f"listen={address}", f"counter.go={tmp_path / 'go'}", "counter.count=50")
+    settings = (f"counter.go={tmp_path / 'go'}", "counter.count=50", "counter.waits=0")
+    process = start(graph, tmp_path, f"listen={address}", *settings)
     heard: list[tuple[str, bytes]] = []
     before = read_until(process, "run toys-")
     with stranger(address) as session:
@@ -40,6 +42,9 @@ def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path
             f"{run_of(before)}/**", lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
         )
         before += read_until(process, "processes are ready")
+        graph_read = load_graph(graph, ("sink.path=x", *settings))
+        processes = {f"{stage}/{replica}" for stage, replica in graph_read.processes()}
+        wait_until(lambda: processes <= {key.partition("/h/")[2] for key, _ in heard})  # whose pulse comes knows us
         (tmp_path / "go").touch()
         ended = finish(process, tmp_path, before)
     assert ended.code == 0, ended.output
