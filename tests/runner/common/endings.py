@@ -12,7 +12,7 @@ from typing import Literal
 
 from runner.contract import Finished, Stage
 from tests.runner.common.survivors import first_time
-from tests.runner.common.toys import Double, Number
+from tests.runner.common.toys import Double, DoubleSink, Number
 
 if "TESTS_SAY_GOODBYE" in os.environ:  # in every process that imports this, once it ends
     atexit.register(print, "goodbye")
@@ -63,15 +63,24 @@ class Slow(Stage):
         subprocess.Popen(["sleep", "611"])
 
     def on_number(self, number: Number) -> Iterator[Double]:
-        try:
-            yield Double(value=2 * number.value)
-        finally:  # whether it goes on or is stopped there: the sink ends the graph
-            if number.last:
-                subprocess.run(["sleep", "0.8"], check=True)
-                (self._marks / "worked").touch()
+        yield Double(value=2 * number.value)
+        if number.last:
+            (self._marks / "works").touch()
+            subprocess.run(["sleep", "0.8"], check=True)
+            (self._marks / "worked").touch()
 
     def close(self) -> None:
         self._helper.communicate("park\n")
+
+
+class PatientSink(DoubleSink):
+    """Ends the graph once the doubler works on."""
+
+    def on_double(self, double: Double) -> Finished | None:
+        finished = super().on_double(double)
+        while finished and not (self._config.path.parent / "works").exists():
+            time.sleep(0.01)
+        return finished
 
 
 class Closing(Stage):

@@ -242,7 +242,9 @@ def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
 @pytest.mark.slow
 def test_a_host_that_is_started_again_takes_part_again(here: Run, parties, tmp_path: Path):
     graph = changed(HOSTS, tmp_path, Counter="GatedCounter")
-    party = parties(on_loopback(), tmp_path, graph=graph).start_all(f"counter.go={tmp_path / 'go'}")
+    party = parties(on_loopback(), tmp_path, graph=graph).start_all(
+        "worker.seconds=0.6", f"counter.go={tmp_path / 'go'}"
+    )
     before = read_until(party.hosts["head"], "sum")
     party.hosts["worker1"].kill()
     before += read_until(party.hosts["head"], "is cut off")

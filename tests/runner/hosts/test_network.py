@@ -29,7 +29,6 @@ from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
 from tests.runner.common.machines import HOSTS, free_address
 from tests.runner.common.runs import DOUBLES, finish, start
-from tests.runner.transport.test_bad_input import public_address
 
 OUT = "sink.path=out.txt"
 LINE = "hosts: {head: 127.0.0.1:7447, worker1: 127.0.0.1, worker2: 127.0.0.1}"
@@ -248,7 +247,7 @@ def test_the_kernel_of_this_machine_is_not_blamed_for_a_process_on_another(tmp_p
 
 @pytest.mark.parametrize("opens", [False, True])
 def test_nothing_listens_where_others_could_call_unless_the_graph_says_so(tmp_path: Path, opens: bool):
-    address = public_address()
+    address = f"tcp/{free_address()}"
     settings = ("counter.count=100000", "counter.period=0.005", "sink.count=100000")
     opened = (f"listen={address}",) if opens else ()
     process = start(DOUBLES, tmp_path, *settings, *opened)

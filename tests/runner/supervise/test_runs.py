@@ -164,7 +164,7 @@ def test_children_die_with_their_supervisor(tmp_path: Path):
 
 def test_corrupt_bytes_are_refused_and_counted_and_the_process_lives_on(tmp_path: Path):
     graph = changed(DOUBLES, tmp_path, Counter="GatedCounter")
-    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}")
+    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}", "counter.count=40", "sink.count=40")
     before = read_until(process, "processes are ready")
     match = re.search(r"run (\S+) on (\S+)", before)
     assert match is not None
@@ -176,7 +176,7 @@ def test_corrupt_bytes_are_refused_and_counted_and_the_process_lives_on(tmp_path
     (tmp_path / "go").touch()
     ended = finish(process, tmp_path, before)
     bus.close()
-    assert len(ended.result) == 5
+    assert len(ended.result) == 40
     assert "again/doubler/0/number: message refused (1 so far): Envelope: MessagePack data is malformed" in ended.output
     assert "j/doubler: message refused (1 so far): Journal" in ended.output
 

@@ -4,7 +4,6 @@ import contextlib
 import json
 import random
 import re
-import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from runner.testing import read_until
 from runner.transport.bus import Bus
 from runner.transport.presence import Presence
 from runner.transport.session import new_endpoint
+from tests.runner.common.machines import free_address
 from tests.runner.common.runs import ALBUM, TOYS, changed, finish, meeting_of, processes_of, run, start, wait_for_links
 from tests.runner.common.survivors import Picture
 from tests.runner.common.toys import Answer
@@ -132,9 +132,7 @@ def test_ten_thousand_messages_of_a_listener_change_nothing(tmp_path: Path):
 
 
 def public_address() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/{free_address()}"
 
 
 @contextlib.contextmanager
