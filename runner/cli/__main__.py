@@ -1,7 +1,5 @@
 """``python -m runner.cli`` is ``runner``."""
 
-import sys
+from runner.cli.main import run
 
-from runner.cli.main import main
-
-sys.exit(main())
+run()

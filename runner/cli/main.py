@@ -4,12 +4,20 @@ import argparse
 import os
 import sys
 from collections.abc import Collection, Sequence
+from typing import NoReturn
 
 from runner.cli.commands import Command, graphs, keys, live, machine, new, recordings, replay
 from runner.cli.completion import complete_and_exit
 from runner.contract import EXIT_REFUSED, Refused
 
 EXIT_INTERRUPTED = 130
+
+
+def run() -> NoReturn:
+    """The program ``runner``: one command, with whose exit status it ends."""
+    from runner.process.forks import end_with
+
+    end_with(main)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

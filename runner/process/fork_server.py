@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import ctypes
 import gc
@@ -19,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 from runner.process.children import DESCENT, PARENT, Handle, die_with_parent, ending, origin, spawn
-from runner.process.forks import Forked, Threads, fork, refuse_threads
+from runner.process.forks import Forked, Threads, call_to_the_end, fork, refuse_threads
 
 PREPARE_SECONDS = 180.0
 """How long the fork server may prepare a process."""
@@ -182,7 +181,7 @@ def _start(order: _Order, connection: Connection) -> int:
     return pid
 
 
-def _live(order: _Order, parent: int, connection: Connection, writing: int) -> int:
+def _live(order: _Order, parent: int, connection: Connection, writing: int) -> int | None:
     """What the new process does, with the fork server's ``connection``, and a pipe to say that it is there."""
     connection.close()
     gc.freeze()
@@ -195,10 +194,7 @@ def _live(order: _Order, parent: int, connection: Connection, writing: int) -> i
         time.sleep(0.0005)
     os.write(writing, os.getpid().to_bytes(8, "little"))
     os.close(writing)
-    try:
-        return importlib.import_module(order.module).main()
-    finally:
-        atexit._run_exitfuncs()  # pyright: ignore - as multiprocessing does
+    return call_to_the_end(importlib.import_module(order.module).main)
 
 
 def _read_from_stdin(task: bytes) -> None:

@@ -7,6 +7,7 @@ shares the memory of what was imported. Whoever forks must have one thread and, 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -100,13 +101,41 @@ def fork(work: Callable[[], int | None], log: Path | None = None) -> int:
 
 def _run(work: Callable[[], int | None], log: Path | None) -> NoReturn:
     """Never returns to what this process was forked from, whatever happens."""
-    code = EXIT_FAILED
-    try:
+
+    def logged() -> int | None:
         os.setpgid(0, 0)
         if log is not None:
             with log.open("ab") as output:
                 os.dup2(output.fileno(), 1)
                 os.dup2(output.fileno(), 2)
+        return work()
+
+    _end_with(logged)
+
+
+# ------------------------------------------------------------------------------------ how a process ends
+
+
+def end_with(main: Callable[[], int | None]) -> NoReturn:
+    """Ends this process with the exit status that ``main`` returns, as ``sys.exit(main())`` does.
+
+    But the interpreter is not taken apart: a thread that is in a call of Zenoh meanwhile would abort the process, such
+    as the one that says goodbye to a machine which is cut off.
+    """
+    _end_with(lambda: call_to_the_end(main))
+
+
+def call_to_the_end(main: Callable[[], int | None]) -> int | None:
+    """Calls ``main`` and then what was registered with :mod:`atexit`."""
+    try:
+        return main()
+    finally:
+        atexit._run_exitfuncs()  # pyright: ignore - as multiprocessing does
+
+
+def _end_with(work: Callable[[], int | None]) -> NoReturn:
+    code = EXIT_FAILED
+    try:
         code = work() or 0
     except SystemExit as end:
         code = _status(end)

@@ -23,6 +23,7 @@ from runner.message.codec import CaughtUp, CodecError, Envelope, Journal, LogLin
 from runner.message.packet import RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, is_orphan, last_words, print_where_it_crashes
+from runner.process.forks import end_with
 from runner.process.health import Heartbeat
 from runner.process.redelivery import Redelivery
 from runner.recording.recording import Completeness
@@ -286,4 +287,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with(main)

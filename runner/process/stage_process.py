@@ -28,7 +28,7 @@ from runner.message.packet import GATEWAY, RECORDER, Packet, Process
 from runner.message.refusals import Refusals
 from runner.process.children import die_with_parent, last_words, prefer_for_oom_kill, print_where_it_crashes
 from runner.process.delivery import Delivery, Stopped
-from runner.process.forks import EXIT_FAILED
+from runner.process.forks import EXIT_FAILED, end_with
 from runner.process.health import Heartbeat
 from runner.process.inbox import Ready
 from runner.process.intake import Consumed, Intake
@@ -499,4 +499,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with(main)
