@@ -159,5 +159,8 @@ def _leave(code: int) -> NoReturn:
         threading._shutdown()  # pyright: ignore - as multiprocessing does
         sys.stdout.flush()
         sys.stderr.flush()
+    except OSError as error:  # what cannot be written is no success
+        code = code or EXIT_FAILED
+        print(error, file=sys.stderr)
     finally:
         os._exit(code)

@@ -1,5 +1,6 @@
 """How the program ``runner`` ends."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -36,3 +37,13 @@ def test_a_thread_that_is_in_a_call_of_zenoh_changes_no_exit_status(tmp_path: Pa
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.endswith("the last words\n")
+
+
+def test_what_cannot_be_written_is_no_success(tmp_path: Path):
+    command = [sys.executable, "-m", "runner.cli", "check", "--help"]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, stdout=full, stderr=subprocess.PIPE, timeout=60, check=False
+        )
+    assert (done.returncode, done.stderr) == (1, b"[Errno 28] No space left on device\n")
