@@ -44,9 +44,10 @@ bench: setup  ## speed of the kernel
 	$(BIN)/python -m benchmarks.kernel
 
 reference: setup  ## record recordings/reference.mcap again: one small image through all of perception
-	rm -rf build/reference build/reference-* recordings/reference.mcap
+	rm -rf build/reference build/reference-*
 	$(BIN)/python -m benchmarks.clutter build/reference --scenes 1 --seed 5
 	$(BIN)/runner up graphs/reference.yaml --recordings build
+	rm -f recordings/reference.mcap
 	$(BIN)/runner recover build/reference-*.mcap recordings/reference.mcap
 
 clean:
