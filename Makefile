@@ -1,8 +1,8 @@
 # `make up` runs the main job, `make test` passes the tests; both set up what they need on a bare machine.
 PYTHON ?= python3
 BIN := .venv/bin
-# Two files of tests at a time: most wait for processes more than they compute.
-PYTEST := $(BIN)/pytest --numprocesses 2 --dist loadfile
+# Three files of tests at a time, in the order of pyproject.toml: most wait for processes more than they compute.
+PYTEST := $(BIN)/pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 STAMP := .venv/.installed
 SET ?=
 export PYOPENGL_PLATFORM ?= egl

@@ -42,7 +42,7 @@ def test_the_arm_is_stopped_on_its_way_by_a_command_and_by_ctrl_c(
     graph = tmp_path / "slow.yaml"
     text = (ROOT / "graphs" / "interactive.yaml").read_text()
     graph.write_text(text.replace("stages.world:World", "tests.slow_world:SlowWorld"))
-    settings = ("--set", "world.seed=1", "--set", "corrector.calibrate=false", "--recordings", str(tmp_path / "rec"))
+    settings = ("--set", "world.seed=3", "--set", "corrector.calibrate=false", "--recordings", str(tmp_path / "rec"))
     up = (*RUNNER, "up", str(graph), *settings)
     restore = (*RUNNER, "call", "demonstrator", "restore", "name=breakfast")
     with subprocess.Popen(up, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
@@ -97,7 +97,7 @@ def test_a_goal_is_taught_disturbed_and_restored_by_commands(tmp_path: Path, mon
         "up",
         "graphs/interactive.yaml",
         "--set",
-        "world.seed=1",
+        "world.seed=3",
         "--set",
         "corrector.calibrate=false",
         "--recordings",
