@@ -69,3 +69,9 @@ def test_the_packages_that_the_runner_needs_are_counted():
     count = len(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"])
     said = f"{count} needed, {count} known as tested"
     assert said in (ROOT / "docs" / "runner" / "tools.md").read_text()
+
+
+def test_pytest_is_given_every_file_of_tests():
+    given = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["testpaths"]
+    found = {path for one in given for place in ROOT.glob(one) for path in (place, *place.rglob("test_*.py"))}
+    assert [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path not in found] == []
