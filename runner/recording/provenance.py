@@ -5,6 +5,7 @@ import itertools
 import os
 import platform
 import subprocess
+import sys
 import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
@@ -49,9 +50,16 @@ HASHED_FILES = 1000
 
 
 def package_versions() -> dict[str, str]:
-    """Every installed package."""
-    found = ((one["Name"], one["Version"]) for one in (installed.metadata for installed in distributions()))
-    return dict(sorted(found, key=lambda named: named[0].lower()))
+    """Every installed package; of two of a name the one that is imported.
+
+    What a package brings along for itself does not count: setuptools adds its own folder of them to the search path
+    once it is imported, so the answer would depend on what has been imported so far.
+    """
+    folders = [folder for folder in sys.path if not (Path(folder).parent / "__init__.py").exists()]
+    found: dict[str, str] = {}
+    for installed in distributions(path=folders):
+        found.setdefault(installed.metadata["Name"], installed.metadata["Version"])
+    return dict(sorted(found.items(), key=lambda named: named[0].lower()))
 
 
 def changes(then: Mapping[str, str], now: Mapping[str, str], names: Iterable[str]) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,15 @@ import pytest
 from runner.graph.graph import NUMERICAL, graph_to_json
 from runner.graph.reading import load_graph
 from runner.recording import provenance
-from runner.recording.provenance import DISTRIBUTION, FIRST_NUMERICAL, fingerprint, numerical, revision, runner_version
+from runner.recording.provenance import (
+    DISTRIBUTION,
+    FIRST_NUMERICAL,
+    fingerprint,
+    numerical,
+    package_versions,
+    revision,
+    runner_version,
+)
 from runner.recording.recording import Recording
 from tests.runner.common.recordings import TOYS, record_toys, rewrite
 
@@ -57,6 +66,24 @@ def test_a_changed_source_is_dirty(project: Path):
 def test_what_is_installed_or_nowhere_has_no_revision():
     assert revision(graph("numpy.stages:Camera", "nowhere.stages:Camera", "msgspec")) == ""
     assert revision({"stages": ["no", "mapping"]}) == ""
+
+
+def test_the_packages_do_not_depend_on_what_has_been_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def installed(folder: Path, name: str, number: str) -> None:
+        (folder / f"{name}-{number}.dist-info").mkdir(parents=True)
+        (folder / f"{name}-{number}.dist-info" / "METADATA").write_text(f"Name: {name}\nVersion: {number}\n")
+
+    installed(tmp_path, "provenance-tool", "1.0")
+    (tmp_path / "provenance_tool" / "_vendor").mkdir(parents=True)
+    (tmp_path / "provenance_tool" / "__init__.py").touch()
+    installed(tmp_path / "provenance_tool" / "_vendor", "provenance-helper", "2.0")
+    installed(tmp_path / "later", "provenance-tool", "3.0")
+    before = package_versions()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(
+        sys, "path", [*sys.path, str(tmp_path / "provenance_tool" / "_vendor"), str(tmp_path / "later")]
+    )
+    assert package_versions() == before | {"provenance-tool": "1.0"}
 
 
 def test_the_version_of_the_runner_is_recorded_beside_it(tmp_path: Path):
