@@ -58,7 +58,7 @@ def test_the_arm_is_stopped_on_its_way_by_a_command_and_by_ctrl_c(
         assert f"held: {first}" in stop.stdout
         with subprocess.Popen(restore, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as asked:
             second = grasped(process)
-            time.sleep(0.5)
+            time.sleep(2)
             process.send_signal(signal.SIGINT)
             printed = process.communicate(timeout=60)[0]
             assert "the graph ended before it was done" in asked.communicate(timeout=60)[0]

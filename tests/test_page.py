@@ -57,7 +57,9 @@ def paged(folder: Path, monkeypatch: pytest.MonkeyPatch, *settings: str) -> Gene
     graph = ROOT / "graphs" / "interactive.yaml"
     process = start_graph(graph, *settings, "corrector.calibrate=false", folder=folder, options=["--page"])
     try:
-        printed = read_until(process, "processes are ready")
+        printed = read_until(process, "page: http")
+        if "processes are ready" not in printed:
+            printed += read_until(process, "processes are ready")
         (url,) = re.findall(r"page: (\S+)", printed)
         with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
             yield page, lambda: finish(process, folder, before=printed)

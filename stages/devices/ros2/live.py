@@ -156,12 +156,12 @@ class LiveCamera:
     def _silent(self) -> str:
         for topic in self._source.images:
             came, stamp = self._newest.get(topic, (0, 0))
-            if came < self._asked_ns:
-                quiet = f"for {_age(time.time_ns(), came):.1f} s" if came else "yet"
-                return f"{topic}: is published, but no message has come {quiet}"
-            if _age(came, stamp) > self._patience.max_age:
+            if came >= self._asked_ns and _age(came, stamp) > self._patience.max_age:
                 apart = f"the newest stamp is {(came - stamp) / 1e9:.1f} s before its arrival"
                 return f"{topic}: {apart}; the image is old, or the clocks of the machines differ"
+            if min(came, stamp) < self._asked_ns:
+                quiet = f"for {_age(time.time_ns(), came):.1f} s" if came else "yet"
+                return f"{topic}: is published, but no message has come {quiet}"
         return ""
 
     def _unpaired(self) -> str:

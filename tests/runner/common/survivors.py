@@ -341,7 +341,9 @@ class Camera(Stage):
         for number in range(self._config.count):
             while taken is not None and taken.stat().st_size < number:
                 time.sleep(0.01)
-            yield Picture(pixels=np.full(self._config.size, number, np.uint8), last=number == self._config.count - 1)
+            yield Picture(
+                pixels=np.full(self._config.size, number % 256, np.uint8), last=number == self._config.count - 1
+            )
 
 
 class Album(Stage):

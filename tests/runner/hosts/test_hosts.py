@@ -80,6 +80,15 @@ def parties() -> Iterator[Callable[..., Party]]:
         party.close()
 
 
+def gated(folder: Path) -> Path:
+    """The graph, of which the last number waits for the file of ``gate``."""
+    return changed(HOSTS, folder, Counter="GatedCounter")
+
+
+def gate(folder: Path) -> str:
+    return f"counter.go={folder / 'go'}"
+
+
 def with_keys(machines: Machines, folder: Path) -> tuple[str, ...]:
     """Makes keys for the machines; the options that turn them on."""
     addresses = {name: machines.addresses.get(name, "127.0.0.1").partition(":")[0] for name in NAMES}
@@ -230,9 +239,11 @@ def test_a_host_hears_the_end_while_a_stage_prepares(parties, tmp_path: Path):
 
 
 def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
-    party = parties(on_loopback(), tmp_path).start_all(*SLOW_PIECES)
+    party = parties(on_loopback(), tmp_path, graph=gated(tmp_path)).start_all(*SLOW_PIECES, gate(tmp_path))
     before = read_until(party.hosts["head"], "sum")
     party.hosts["worker1"].kill()
+    before += read_until(party.hosts["head"], "is cut off")
+    (tmp_path / "go").touch()
     head = party.end("head", before)
     assert "host worker1 is cut off, with 1 processes" in head.output
     assert_same_result(head, here)
@@ -241,10 +252,7 @@ def test_a_killed_host_loses_nothing(here: Run, parties, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_host_that_is_started_again_takes_part_again(here: Run, parties, tmp_path: Path):
-    graph = changed(HOSTS, tmp_path, Counter="GatedCounter")
-    party = parties(on_loopback(), tmp_path, graph=graph).start_all(
-        "worker.seconds=0.6", f"counter.go={tmp_path / 'go'}"
-    )
+    party = parties(on_loopback(), tmp_path, graph=gated(tmp_path)).start_all("worker.seconds=0.6", gate(tmp_path))
     before = read_until(party.hosts["head"], "sum")
     party.hosts["worker1"].kill()
     before += read_until(party.hosts["head"], "is cut off")
@@ -265,7 +273,7 @@ def test_a_process_elsewhere_has_gone_even_where_its_last_words_cannot_be_kept()
 
 @pytest.mark.slow
 def test_hosts_end_with_their_head(parties, tmp_path: Path):
-    party = parties(on_loopback(), tmp_path).start_all(*SLOW_PIECES)
+    party = parties(on_loopback(), tmp_path, graph=gated(tmp_path)).start_all(gate(tmp_path))
     read_until(party.hosts["head"], "processes are ready")
     party.hosts["head"].kill()
     for name in NAMES[1:]:
@@ -289,7 +297,7 @@ def test_a_device_comes_to_rest_where_its_head_has_gone(parties, tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_host_that_stands_still_does_not_keep_the_head_from_its_end(parties, tmp_path: Path):
-    party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.6")
+    party = parties(on_loopback(), tmp_path).start_all("worker.seconds=0.05", "counter.count=1000")
     before = read_until(party.hosts["head"], "sum")
     party.hosts["worker1"].send_signal(signal.SIGSTOP)
     party.hosts["head"].send_signal(signal.SIGINT)
@@ -400,10 +408,12 @@ def test_three_machines_with_keys_give_the_bytes_of_one(here, namespaces, partie
 @pytest.mark.parametrize("router", [(), ("--set", "router=head")], ids=["direct", "routed"])
 def test_a_machine_that_is_cut_off_in_mid_frame_loses_nothing(here, namespaces, parties, tmp_path: Path, router):
     options = (*with_keys(namespaces, tmp_path / "keys"), *router)
-    party = parties(namespaces, tmp_path, options).start_all(*SLOW_PIECES)
+    party = parties(namespaces, tmp_path, options, gated(tmp_path)).start_all(*SLOW_PIECES, gate(tmp_path))
     before = read_until(party.hosts["head"], "sum")
     namespaces.cut("worker1")
     try:
+        before += read_until(party.hosts["head"], "is cut off")
+        (tmp_path / "go").touch()
         head = party.end("head", before)
         worker = party.end("worker1")
     finally:
@@ -416,16 +426,17 @@ def test_a_machine_that_is_cut_off_in_mid_frame_loses_nothing(here, namespaces, 
 
 @pytest.mark.slow
 def test_a_machine_that_comes_back_disturbs_nobody(here, namespaces, parties, tmp_path: Path):
-    party = parties(namespaces, tmp_path, with_keys(namespaces, tmp_path / "keys"))
-    party.start_all("worker.seconds=1.2")
+    party = parties(namespaces, tmp_path, with_keys(namespaces, tmp_path / "keys"), gated(tmp_path))
+    party.start_all("worker.seconds=1.2", gate(tmp_path))
     before = read_until(party.hosts["head"], "sum")
     namespaces.cut("worker1")
     before += read_until(party.hosts["head"], "host worker1 is cut off")
     namespaces.mend("worker1")
     cut_off = party.hosts.pop("worker1")
     party.start("worker1")
+    before += read_until(party.hosts["head"], "host worker1 is back")
+    (tmp_path / "go").touch()
     head = party.end("head", before)
-    assert "host worker1 is back" in head.output
     assert_same_result(head, here)
     assert cut_off.wait(60) == 1
     cut_off.communicate()

@@ -259,6 +259,7 @@ def test_an_engineer_sees_processes_topics_calls_and_the_log(page: Page) -> None
     form.get_by_label("note").fill("for a while")
     form.get_by_role("button", name="Call").click()
     expect(page.get_by_role("log")).to_contain_text("lamp is blue for a while")
+    expect(form.get_by_role("button", name="Call")).to_be_enabled()
     form.get_by_label("on", exact=True).uncheck()
     form.get_by_role("button", name="Call").click()
     expect(page.get_by_role("log")).to_contain_text("lamp is dark")
@@ -306,6 +307,7 @@ def test_a_recording_is_told_again_from_its_beginning(lamp: Lamp, page: Page) ->
     blinked = re.compile(r"has blinked (\d+) times")
     (before,) = blinked.findall(page.get_by_text("has blinked").inner_text())
     for more in (1, 2):
+        expect(page.get_by_role("button", name="Blink")).to_be_enabled()
         page.get_by_label("How often").fill("1")
         page.keyboard.press("Enter")
         expect(page.get_by_text("has blinked")).to_have_text(re.compile(rf"has blinked {int(before) + more} times"))

@@ -224,6 +224,7 @@ def test_a_page_whose_texts_do_not_come_asks_again(server: Server) -> None:
     server.unreachable = "en.json"
     server.page.goto(URL)
     expect(server.page.get_by_text("Loading")).to_be_visible()
+    wait_until(lambda: "en.json" in server.asked or server.page.wait_for_timeout(20))
     server.unreachable = ""
     expect(server.page.get_by_role("link", name="Scene")).to_be_visible()
     assert server.asked.count("en.json") > 1

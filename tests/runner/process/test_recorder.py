@@ -73,7 +73,7 @@ class Session:
             self._tell(Step(stage, 0, 0, steps, "", (), (), 0, 0, 0, 0, "ended"))
         wait_until(lambda: ("supervisor", "ended") in self._recorded)
         self.process.terminate()
-        code = self.process.wait(20)
+        code = self.process.wait(60)
         self.bus.close()
         return code
 
@@ -169,7 +169,7 @@ def test_sigint_is_left_to_the_supervisor(tmp_path: Path):
 def test_a_recording_that_cannot_be_created_is_refused(tmp_path: Path):
     (tmp_path / "pictures.mcap").touch()
     session = Session(tmp_path)
-    assert session.process.wait(20) == EXIT_REFUSED
+    assert session.process.wait(60) == EXIT_REFUSED
     assert "cannot be created: File exists" in reason_in(session.log)
     session.bus.close()
 
@@ -181,7 +181,7 @@ def test_a_recording_that_cannot_be_begun_is_refused(tmp_path: Path):
         session = Session(tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert session.process.wait(20) == EXIT_REFUSED
+    assert session.process.wait(60) == EXIT_REFUSED
     assert reason_in(session.log) == f"recording {session.path}: cannot be written: File too large"
     session.bus.close()
 
@@ -191,7 +191,7 @@ def test_a_recorder_that_fails_ends_and_the_recording_says_why(tmp_path: Path, w
     session = Session(tmp_path, "tests.runner.process.fails", where)
     session.wait()
     session.journal(session.send(0, pictures[0]))
-    assert session.process.wait(20) == EXIT_INCOMPLETE
+    assert session.process.wait(60) == EXIT_INCOMPLETE
     session.bus.close()
     reason = "the recorder failed: MemoryError: no room for a step"
     assert reason_in(session.log).startswith(f"{session.path}: INCOMPLETE: {reason}; ")
@@ -203,9 +203,9 @@ def test_a_recorder_ends_as_it_must_also_where_the_disk_under_its_log_is_full(tm
     session = Session(tmp_path, "tests.runner.process.fails", "taker", log=Path("/dev/full"))
     session.wait()
     session.journal(session.send(0, pictures[0]))
-    assert session.process.wait(20) == EXIT_INCOMPLETE
+    assert session.process.wait(60) == EXIT_INCOMPLETE
     session.bus.close()
     assert "the recorder failed: MemoryError" in str(Recording(session.path).verdict)
     refused = Session(tmp_path, log=Path("/dev/full"))
-    assert refused.process.wait(20) == EXIT_REFUSED
+    assert refused.process.wait(60) == EXIT_REFUSED
     refused.bus.close()

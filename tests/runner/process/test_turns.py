@@ -20,7 +20,7 @@ stages:
 
 
 def test_what_arrives_meanwhile_is_worked_on_before_a_handler_goes_on(tmp_path: Path) -> None:
-    run = run_graph(WALK.replace("COUNT", "1"), folder=tmp_path, seconds=40)
+    run = run_graph(WALK.replace("COUNT", "1"), folder=tmp_path)
     assert (run.code, "arrived at 1 after" in run.output) == (0, True), run.output
 
 

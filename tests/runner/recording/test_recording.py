@@ -34,6 +34,7 @@ from runner.recording.recover import recover
 from runner.recording.writer import RecordingWriter
 from tests.runner.common.recordings import TOYS, ToyRun, manifest, offsets, put, record, record_toys, rewrite
 from tests.runner.common.toys import Number, Total
+from tests.runner.common.waiting import wait_until
 
 TOPICS = {"counter/number", "splitter/piece", "worker/answer", "gatherer/total", "sink/finished"}
 FEW = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -592,7 +593,7 @@ def test_a_killed_recorder_loses_no_more_than_the_last_moments(tmp_path: Path):
     path, copy = tmp_path / "growing.mcap", tmp_path / "killed.mcap"
     recorder = writer(path)
     put(recorder, number(0))
-    time.sleep(0.6)
+    wait_until(lambda: "counter.number#0" in Recording(path).messages)
     put(recorder, number(1))
     shutil.copy(path, copy)
     recorder.close()

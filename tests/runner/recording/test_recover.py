@@ -238,7 +238,7 @@ def wait_for_output(process: subprocess.Popen[str], folder: Path) -> None:
 
 
 def everything(process: subprocess.Popen[str]) -> None:
-    for pid in [process.pid, *(child.pid for child in children(process))]:
+    for pid in [*(child.pid for child in children(process)), process.pid]:  # of whom the first kills none of the others
         os.kill(pid, signal.SIGKILL)
 
 

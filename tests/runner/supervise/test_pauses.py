@@ -9,7 +9,7 @@ import pytest
 
 from runner.recording.recording import Recording
 from runner.testing import read_until
-from tests.runner.common.runs import TOYS, finish, pid_of, processes_of, start
+from tests.runner.common.runs import TOYS, changed, finish, pid_of, processes_of, start
 
 COUNT = 80
 VICTIMS = {"worker": "worker-0", "publisher": "splitter-0", "recorder": "recorder-0", "supervisor": ""}
@@ -23,9 +23,11 @@ def test_a_pause_of_any_process_loses_nothing(tmp_path: Path, seconds: float):
     graphs, seen = {}, {}
     for victim, folder in folders.items():
         folder.mkdir()
-        graphs[victim] = start(TOYS, folder, f"counter.count={COUNT}", "counter.period=0.2")
+        settings = (f"counter.go={tmp_path / 'go'}", "counter.waits=0", f"counter.count={COUNT}", "counter.period=0.2")
+        graphs[victim] = start(changed(TOYS, folder, Counter="GatedCounter"), folder, *settings)
     for victim, process in graphs.items():
         seen[victim] = read_until(process, "processes are ready")
+    (tmp_path / "go").touch()
     time.sleep(1)
     pids = {victim: pid_of(folders[victim], name) if name else graphs[victim].pid for victim, name in VICTIMS.items()}
     for pid in pids.values():

@@ -27,6 +27,7 @@ from tests.runner.common.runs import (
     start,
     wait_for_links,
 )
+from tests.runner.common.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,11 @@ def test_one_replica_and_another_seed(plain: Run, tmp_path: Path):
 
 
 def test_a_killed_replica_changes_no_byte(plain: Run, tmp_path: Path):
-    killed = run(TOYS, tmp_path, "worker.die_at=2", "worker.seconds=0.05")
+    graph = changed(TOYS, tmp_path, Counter="GatedCounter")
+    process = start(graph, tmp_path, f"counter.go={tmp_path / 'go'}", "worker.die_at=2", "worker.seconds=0.05")
+    before = read_until(process, "noticed")
+    (tmp_path / "go").touch()
+    killed = finish(process, tmp_path, before)
     assert killed.code == 0, killed.output
     assert killed.result == plain.result
     assert re.search(r"watcher +noticed: worker\.\d restarted: killed by SIGKILL", killed.output)
@@ -156,10 +161,7 @@ def test_children_die_with_their_supervisor(tmp_path: Path):
     assert len(processes_of(tmp_path)) == 4
     process.kill()
     process.communicate()
-    deadline = time.monotonic() + 10
-    while processes_of(tmp_path) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert processes_of(tmp_path) == []
+    wait_until(lambda: processes_of(tmp_path) == [])
 
 
 def test_corrupt_bytes_are_refused_and_counted_and_the_process_lives_on(tmp_path: Path):

@@ -95,7 +95,7 @@ def look(endpoint: str, patience: Patience = LONG, source: Source = SOURCE) -> t
 def test_a_look_is_the_next_image() -> None:
     with router() as endpoint, driver(endpoint):
         asked = time.time_ns()
-        frame, said = look(endpoint)
+        frame, said = look(endpoint, Patience(warn=30.0, give_up=30.0, settle=0.1))
     assert frame.stamp_ns > asked and said == []
     assert np.array_equal(frame.rgb, RGB)
     assert np.array_equal(np.round(frame.depth * 1000), MILLIMETRES)

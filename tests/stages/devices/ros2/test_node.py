@@ -117,7 +117,8 @@ def test_another_hash_is_named_with_the_distribution_that_has_it() -> None:
     ):
         ActionServer(arm, "/follow")
         feedback = client.subscribe("/follow/_action/feedback", f"{TRAJECTORY}_FeedbackMessage", print)
-        obstacle = client.wait_for(feedback, 0.5)
+        wait_until(lambda: "publishes" in client.obstacle(feedback))
+        obstacle = client.obstacle(feedback)
     ours, theirs = (one.types.hash(f"{TRAJECTORY}_FeedbackMessage") for one in (client, arm))
     assert "/follow/_action/feedback: /lab/arm publishes" in obstacle
     assert ours in obstacle and theirs in obstacle and ours != theirs
