@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from runner.testing import Run, finish, read_until, runner, start_graph
+from runner.testing import Run, finish, runner, start_graph
 from stages.messages import Answer, Question
-from tests.runner.page.browser import browser, faults, opened
+from tests.runner.page.browser import browser, faults, opened, read_address
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,10 +57,7 @@ def paged(folder: Path, monkeypatch: pytest.MonkeyPatch, *settings: str) -> Gene
     graph = ROOT / "graphs" / "interactive.yaml"
     process = start_graph(graph, *settings, "corrector.calibrate=false", folder=folder, options=["--page"])
     try:
-        printed = read_until(process, "page: http")
-        if "processes are ready" not in printed:
-            printed += read_until(process, "processes are ready")
-        (url,) = re.findall(r"page: (\S+)", printed)
+        printed, url = read_address(process)
         with browser() as chromium, opened(chromium, url, patience_ms=120_000) as page:
             yield page, lambda: finish(process, folder, before=printed)
     finally:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import subprocess
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -10,11 +12,22 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from runner.testing import read_until
+
 OPTIONS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 )
 SERIOUS = ("serious", "critical")
+
+
+def read_address(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """What a graph with a page prints until it is ready, and where the page is: two processes say so, in any order."""
+    printed = read_until(process, "page: http")
+    (url,) = re.findall(r"page: (\S+)", printed)
+    if "processes are ready" not in printed:
+        printed += read_until(process, "processes are ready")
+    return printed, url
 
 
 @contextmanager

@@ -19,9 +19,9 @@ from websockets.sync.client import connect
 from runner.contract import Refused
 from runner.page.guard import new_token
 from runner.page.watch import Watch
-from runner.testing import finish, read_until, runner, start_graph
+from runner.testing import finish, runner, start_graph
 from tests.runner.common.waiting import wait_until
-from tests.runner.page.browser import browser, faults, opened
+from tests.runner.page.browser import browser, faults, opened, read_address
 from tests.runner.page.toys import LampStory
 
 LAMP = Path(__file__).with_name("lamp.yaml")
@@ -34,10 +34,7 @@ class Lamp:
     def __init__(self, folder: Path, graph: Path = LAMP) -> None:
         self.folder = folder
         self.process = start_graph(graph, folder=folder)
-        self.printed = read_until(self.process, "page: http")
-        self.url = re.findall(r"page: (\S+)", self.printed)[0]
-        if "processes are ready" not in self.printed:
-            self.printed += read_until(self.process, "processes are ready")
+        self.printed, self.url = read_address(self.process)
 
     def finish(self) -> None:
         self.process.terminate()

@@ -48,8 +48,8 @@ def test_a_stranger_hears_every_recorded_message_once_and_byte_for_byte(tmp_path
         (tmp_path / "go").touch()
         ended = finish(process, tmp_path, before)
         recording = Recording(ended.recording)
-        expected = [pack(one) for one in (*recording.envelopes(), *recording.steps)]
-        wait_until(lambda: set(expected) <= {payload for _, payload in heard})
+        expected = {pack(one) for one in (*recording.envelopes(), *recording.steps)}
+        wait_until(lambda: expected <= {payload for _, payload in heard})
     assert ended.code == 0, ended.output
     assert recording.verdict.complete
     messages = [(key.partition("/m/")[2], payload) for key, payload in heard if "/m/" in key]
@@ -131,9 +131,8 @@ def test_the_example_shows_arrays(tmp_path: Path):
     process.terminate()
     finish(process, tmp_path, before)
     heard, shown = first.split(" ", 1)
-    k = (
-        int(heard.removeprefix("camera.picture#")) % 256
-    )  # the first that was sent once the gateway knew of the listener
+    # The first that was sent once the gateway knew of the listener.
+    k = int(heard.removeprefix("camera.picture#")) % 256
     assert shown == f"Picture {{'pixels': array([{k}, {k}, {k}], dtype=uint8), 'last': False}}\n"
 
 
