@@ -81,12 +81,19 @@ def driver(endpoint: str, source: Source = SOURCE) -> Iterator[Driver]:
             running.stop()
 
 
-def look(endpoint: str, patience: Patience = LONG, source: Source = SOURCE) -> tuple[Frame, list[str]]:
-    """A look, and what the stage says until it has one."""
+def look(
+    endpoint: str, patience: Patience = LONG, source: Source = SOURCE, then: Callable[[], object] = lambda: None
+) -> tuple[Frame, list[str]]:
+    """A look, and what the stage says until it has one; ``then`` happens each time that it says something."""
     said: list[str] = []
+
+    def log(text: str, level: str) -> None:
+        said.append(text)
+        then()
+
     camera = Ros2Camera(Ros2Camera.Config(link=Link(router=endpoint), topics=source, patience=patience))
     try:
-        (frame,) = run_stage(camera, [LookRequest(purpose="goal")], log=lambda text, level: said.append(text))
+        (frame,) = run_stage(camera, [LookRequest(purpose="goal")], log=log)
     finally:
         camera.close()
     return frame, said
@@ -167,9 +174,7 @@ def test_what_stops_between_two_looks_is_named(stop: Callable[[Driver], None], s
 def test_who_comes_later_is_waited_for() -> None:
     with router() as endpoint, node(endpoint, "driver") as one:
         started: list[Driver] = []
-        later = threading.Timer(1.0, lambda: started.append(Driver(one)))
-        later.start()
-        frame, said = look(endpoint)
+        frame, said = look(endpoint, then=lambda: started or started.append(Driver(one)))
         started[0].stop()
     assert frame.index == 0
     assert said[0] == (f"no look yet: {SOURCE.color}: nobody publishes it; domain 0 at {endpoint} has none")

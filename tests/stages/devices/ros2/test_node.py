@@ -225,12 +225,12 @@ def test_odd_topics_are_one_line() -> None:
 
 
 def test_keys_let_a_node_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.devices.ros2.node.CALL_SECONDS", 0.5)
     make_keys(tmp_path, [Host("lab", "127.0.0.1"), Host("robot", "127.0.0.1")])
     port = free_port()
     session = open_router(port, "tls", **{"transport/link/tls": tls(credentials(tmp_path, "lab"))})
     with node(f"tls/127.0.0.1:{port}", "in", keys=tmp_path / "robot") as one:
         assert one.others("MP") == []
+    monkeypatch.setattr("stages.devices.ros2.node.CALL_SECONDS", 0.5)
     with pytest.raises(Refused, match="no ROS 2 router"):
         Node(Link(router=f"tls/127.0.0.1:{port}"), print)
     session.close()
