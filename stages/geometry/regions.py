@@ -39,14 +39,14 @@ def area(region: Region) -> float:
     if len(region) < 3:
         return 0.0
     x, y = (region - region[0]).T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+    return 0.5 * float(x @ _next(y) - y @ _next(x))
 
 
 def centroid(region: Region) -> NDArray[np.float64]:
     """Centre of area, 2."""
     origin = region[0]
     p = region - origin
-    q = np.roll(p, -1, axis=0)
+    q = _next(p)
     cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
     return origin + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
 
@@ -96,19 +96,24 @@ def separation(a: Region, b: Region) -> float:
 
     Never more than :func:`gap` and much cheaper: enough to check a clearance.
     """
-    return max(_beyond(a, b), _beyond(b, a))
+    return max(beyond(sides(a), b), beyond(sides(b), a))
 
 
 def edges(region: Region) -> NDArray[np.float64]:
-    """From each corner to the next; as with ``np.roll``, which takes ten times as long."""
-    return np.concatenate([region[1:], region[:1]]) - region
+    """From each corner to the next."""
+    return _next(region) - region
 
 
-def _beyond(region: Region, other: Region) -> float:
-    """How far all of ``other`` lies beyond the edge of ``region`` that separates them best; negative if none does."""
-    along = edges(region)
-    outward = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
-    return float(((outward @ other.T).min(1) - (outward * region).sum(1)).max())
+def _next(region: Region) -> NDArray[np.float64]:
+    """The corner after each; ``np.roll`` takes ten times as long."""
+    return np.concatenate([region[1:], region[:1]])
+
+
+def beyond(sides: tuple[NDArray[np.float64], NDArray[np.float64]], other: Region) -> float:
+    """How far all of ``other`` lies beyond that of a region's :func:`sides` which separates them best; negative if none
+    does."""
+    inward, offset = sides
+    return float((offset - (inward @ other.T).max(1)).max())
 
 
 def _corner_distances(corners: NDArray[np.float64], region: Region) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice, takewhile
 from math import hypot
@@ -14,7 +14,7 @@ from runner.contract import Refused
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
 from stages.geometry.poses import inverse
-from stages.planning.places.placements import Placement, Placements, Scene
+from stages.planning.places.placements import Placement, Placements, Ranked, Scene
 from stages.planning.places.sight import hidden_share
 from stages.planning.symbolic.problem import TABLE
 from stages.planning.symbolic.search import Step
@@ -345,35 +345,31 @@ class Targets:
 
         As many places as are ``enough``, or all that there are.
         """
-        seen_first = self._seen_first(step, scene) if step.region else None
+        placements = self._placements.of(step, scene)
+        if step.region:
+            placements = self._seen_first(placements, scene.others(step.item, step.destination), scene)
         margins = (None,) if step.destination == TABLE else (self._workspace.clearance, 0.0, None)
         if step.destination != TABLE and scene.standing[step.destination].fits(scene.standing[step.item].bottom):
             margins = margins[:2]
         found: Found = [], ()
         for margin in margins:
-            placements = seen_first or self._placements.of(step, scene)
             found = self._free(step, scene, placements, margin=margin, enough=enough)
             if found[0]:
                 break
         return found
 
-    def _seen_first(self, step: Step, scene: Scene) -> list[Placement]:
+    def _seen_first(self, placements: Ranked, others: Sequence[Standing], scene: Scene) -> Ranked:
         """Placements sorted again: of places around a symmetric parent that look alike the hidden ones come later."""
-        others = scene.others(step.item, step.destination)
-        hidden: dict[tuple[float, ...], float] = {}
-        sorted_again: list[Placement] = []
-        for one in self._placements.of(step, scene):
-            place = tuple(np.round(one.standing.T_table_stance[:2, 3] / SIGHT))
-            if place not in hidden:
-                hidden[place] = _hidden(one.standing, others, scene)
-            sorted_again.append(Placement(one.standing, one.cost + hidden[place]))
-        return sorted(sorted_again, key=lambda placement: placement.cost)
+        cells = np.round(placements.places / SIGHT) + 0.0  # -0 is 0
+        _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        hidden = np.array([_hidden(placements[number].standing, others, scene) for number in first])
+        return replace(placements, costs=placements.costs + hidden[cell.ravel()]).sorted()
 
-    def _free(
-        self, step: Step, scene: Scene, placements: Iterable[Placement], *, margin: float | None, enough: int
-    ) -> Found:
+    def _free(self, step: Step, scene: Scene, placements: Ranked, *, margin: float | None, enough: int) -> Found:
         """The first placements that are supported, touch nothing and differ enough to be worth a try each."""
         others = scene.others(step.item, step.destination)
+        if step.destination != TABLE:
+            placements = placements.over(_surface(scene.standing[step.destination]), margin)
         valid: list[Placement] = []
         beyond: list[Placement] = []
         blocking: list[tuple[str, ...]] = []
@@ -402,8 +398,8 @@ class Targets:
         return valid + beyond[: self._workspace.targets], blocking
 
     def _supported(self, item: Standing, destination: str, scene: Scene, margin: float | None) -> bool:
-        """Whether the surface carries the object: all of it, ``margin`` from the edge, or (None) its middle. What would
-        lie on a rim lies there on both sides: on one it would tip into the hollow, as on the slope of its wall.
+        """Whether the surface that is below the object carries it: all of it, or (``margin`` None) its middle. What
+        would lie on a rim lies there on both sides: on one it would tip into the hollow, as on the slope of its wall.
 
         The table always carries all of it, not far beyond where the arm is known to reach.
         """
@@ -415,7 +411,7 @@ class Targets:
             return within_reach and self._on_table(item, scene)
         carrier = scene.standing[destination]
         if margin is not None:
-            held = regions.inside(item.bottom, _surface(carrier), margin=margin) and _is_level(carrier, item.bottom)
+            held = _is_level(carrier, item.bottom)
         else:
             held = _bears(carrier, regions.centroid(item.bottom)) and (
                 carrier.lies_on_rim(item.bottom) or not carrier.lies_on_rim(carrier.centred(item.bottom))
@@ -446,7 +442,7 @@ class Targets:
             if not self._on_table(spot, scene):
                 continue
             room = min((_clearance(spot, other) for other in others), default=np.inf)
-            free = min((regions.separation(spot.outline, other.outline) for other in reserved), default=np.inf)
+            free = min((_separation(spot, other) for other in reserved), default=np.inf)
             if room < self._workspace.clearance:
                 continue
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
@@ -493,7 +489,8 @@ def _surface(carrier: Standing) -> regions.Region:
 
 def _is_level(carrier: Standing, bottom: regions.Region) -> bool:
     """Whether a bottom lies on the floor of a hollow, if there is one, and not partly on the slope of its wall."""
-    return carrier.rest_height(bottom) - carrier.rest_height(carrier.centred(bottom)) < SLOPE
+    height = carrier.rest_height(bottom)
+    return height - carrier.z_floor < SLOPE or height - carrier.rest_height(carrier.centred(bottom)) < SLOPE
 
 
 def _bears(carrier: Standing, middle: Floats) -> bool:
@@ -564,7 +561,12 @@ def _clearance(a: Standing, b: Standing) -> float:
     if a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING:
         return np.inf
     between = _distance(a, b) - a.stance.radius - b.stance.radius
-    return between if between > FAR else regions.separation(a.outline, b.outline)
+    return between if between > FAR else _separation(a, b)
+
+
+def _separation(a: Standing, b: Standing) -> float:
+    """As :func:`stages.geometry.regions.separation`, asked often of the same objects."""
+    return max(regions.beyond(a.sides, b.outline), regions.beyond(b.sides, a.outline))
 
 
 def _is_near(a: Standing, b: Standing, metres: float) -> bool:

@@ -276,14 +276,24 @@ class Standing:
         return regions.moved(self.stance.outline, self.T_table_stance)
 
     @cached_property
+    def sides(self) -> tuple[Floats, Floats]:
+        """Of its outline: see :func:`stages.geometry.regions.sides`."""
+        return regions.sides(self.outline)
+
+    @cached_property
     def floor(self) -> Region:
         """The cavity's floor in the table frame; empty where there is no cavity."""
         cavity = self.stance.cavity
         return regions.moved(cavity.region, self.T_table_stance) if cavity else regions.EMPTY
 
+    @cached_property
+    def middle(self) -> Floats:
+        """Of the cavity's floor, which there must be: x and y in the table frame."""
+        return regions.centroid(self.floor)
+
     def centred(self, bottom: Region) -> Region:
         """A bottom (table frame) moved to the middle of the cavity's floor; as it is where there is no cavity."""
-        return bottom + regions.centroid(self.floor) - regions.centroid(bottom) if len(self.floor) else bottom
+        return bottom + self.middle - regions.centroid(bottom) if len(self.floor) else bottom
 
     def fits(self, bottom: Region) -> bool:
         """Whether a bottom (table frame) finds room on the cavity's floor, so that it need not lean on its wall."""
@@ -307,6 +317,17 @@ class Standing:
 
     def rest_height(self, region: Region) -> float:
         """Height above the table at which a flat bottom over ``region`` (table frame) rests on or in this object."""
+        place = region.tobytes()
+        if place not in self._heights:
+            self._heights[place] = self._rest_height(region)
+        return self._heights[place]
+
+    @cached_property
+    def _heights(self) -> dict[bytes, float]:
+        """Those that were asked for: a planner tries the same places again and again."""
+        return {}
+
+    def _rest_height(self, region: Region) -> float:
         cavity = self.stance.cavity
         if cavity is None or self.lies_on_rim(region):
             return self.z_top

@@ -36,7 +36,7 @@ def distinct_grasps(entry: CatalogueObject) -> list[Grasp]:
     kept: list[Grasp] = []
     seen: list[Floats] = []
     for grasp in entry.grasps:
-        if not any(np.allclose(grasp.T_object_grasp, T, atol=1e-3) for T in seen):
+        if not any(_alike(grasp.T_object_grasp, T) for T in seen):
             kept.append(grasp)
             seen += [pose.T_object_hand for pose in _all_poses(entry, grasp, np.eye(4))]
     return kept
@@ -92,6 +92,10 @@ def _outward(pose: HandPose) -> float:
 def _distinct(poses: list[HandPose]) -> list[HandPose]:
     kept: list[HandPose] = []
     for pose in poses:
-        if not any(np.allclose(pose.T_base_hand, other.T_base_hand, atol=1e-3) for other in kept):
+        if not any(_alike(pose.T_base_hand, other.T_base_hand) for other in kept):
             kept.append(pose)
     return kept
+
+
+def _alike(A: Floats, B: Floats) -> bool:
+    return bool(np.abs(A - B).max() < 1e-3)

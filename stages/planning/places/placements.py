@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.geometry import regions
 from stages.geometry.arrays import Floats
@@ -115,6 +116,46 @@ class Placement:
     cost: float
 
 
+@dataclass(frozen=True)
+class Ranked:
+    """N placements of an object, best first. Mostly the first few are enough: each is made when it is asked for."""
+
+    bases: Sequence[Standing]
+    """The object as it is turned, anywhere."""
+    which: NDArray[np.intp]
+    """As which of these it is turned, N."""
+    places: Floats
+    """Where its origin is in the table frame, metres, N x 2."""
+    costs: Floats
+    """N, metres."""
+
+    def __iter__(self) -> Iterator[Placement]:
+        return (self[number] for number in range(len(self.costs)))
+
+    def __getitem__(self, number: int) -> Placement:
+        base = self.bases[self.which[number]]
+        T = base.T_table_stance.copy()
+        T[:2, 3] = self.places[number]
+        return Placement(Standing(base.name, base.stance, T), float(self.costs[number]))
+
+    def only(self, kept: Sequence[bool] | NDArray[np.bool_] | NDArray[np.intp]) -> Ranked:
+        """Some of them, or all in another order."""
+        return Ranked(self.bases, self.which[kept], self.places[kept], self.costs[kept])
+
+    def sorted(self) -> Ranked:
+        """In the order of their costs."""
+        return self.only(np.argsort(self.costs, kind="stable"))
+
+    def over(self, surface: Region, margin: float | None) -> Ranked:
+        """Those whose bottom lies over a surface, at least ``margin`` from its edge, or (None) the bottom's middle."""
+        inward, offset = regions.sides(surface)
+        bottoms = [base.bottom - base.T_table_stance[:2, 3] for base in self.bases]
+        if margin is None:
+            bottoms, margin = [regions.centroid(bottom)[None] for bottom in bottoms], 0.0
+        nearest = np.array([(bottom @ inward.T).min(0) for bottom in bottoms])
+        return self.only((self.places @ inward.T + nearest[self.which] - offset).min(1) >= margin)
+
+
 class Placements:
     """Placements of one step, best first."""
 
@@ -129,11 +170,8 @@ class Placements:
         self._stances = stances
         self._sides = sides(goal)
 
-    def of(self, step: Step, scene: Scene) -> Iterator[Placement]:
-        """All placements of a step of the goal, in the table frame; their height is still to be found.
-
-        They are many, and mostly the first few are enough: each is made when it is asked for.
-        """
+    def of(self, step: Step, scene: Scene) -> Ranked:
+        """All placements of a step of the goal, in the table frame; their height is still to be found."""
         item = scene.standing[step.item]
         stances = self._stances[self._labels[step.item]]
         nominal = self._nominal(step, scene)
@@ -142,19 +180,20 @@ class Placements:
         shifts = np.array(list(self._shifts(step, scene)))
         lengths = np.hypot(*shifts.T)
         bases: list[Standing] = []
+        places: list[Floats] = []
         costs: list[Floats] = []
         for k, T in enumerate(nominal):
             away = 0.25 * float(np.linalg.norm(T[:2, 3] - nominal[0][:2, 3])) + 1e-4 * k
             for facing, cost in self._orientations(T, item, scene, askew=bool(step.region)):
+                some = slice(None if k == 0 and cost < TURNED else 13)
                 bases.append(Standing.at(step.item, stances, facing))
-                costs.append(away + cost + lengths[: None if k == 0 and cost < TURNED else 13])
-        which = [(base, shift) for base, some in enumerate(costs) for shift in range(len(some))]
-        every = np.concatenate(costs)
-        for number in np.argsort(every, kind="stable").tolist():
-            base, shift = which[number]
-            standing = _shifted(bases[base], shifts[shift])
-            if self._as_taught(step, standing, scene):
-                yield Placement(standing, float(every[number]))
+                places.append(facing[:2, 3] + shifts[some])
+                costs.append(away + cost + lengths[some])
+        which = np.repeat(np.arange(len(bases)), [len(some) for some in costs])
+        ranked = Ranked(bases, which, np.concatenate(places), np.concatenate(costs)).sorted()
+        if not step.region or (step.parent, step.item) in self._taught:
+            return ranked
+        return ranked.only([self._as_taught(step, one.standing, scene) for one in ranked])
 
     def _orientations(self, T: Floats, item: Standing, scene: Scene, *, askew: bool) -> list[tuple[Floats, float]]:
         """Ways to turn an object at a demonstrated pose, with their cost: one, where the goal has a side for it; else
@@ -168,9 +207,7 @@ class Placements:
         return [(faced, 0.0)]
 
     def _as_taught(self, step: Step, item: Standing, scene: Scene) -> bool:
-        """Whether what the goal has beside this object is so, where that is told the other way round."""
-        if not step.region or (step.parent, step.item) in self._taught:
-            return True
+        """Whether what the goal has beside this object, told the other way round, is so."""
         taught = self._taught[step.item, step.parent]
         child = scene.standing[step.parent].T_table_object
         return in_region(taught, item.T_table_object, child, item.stance.item.symmetries)
@@ -264,12 +301,6 @@ def spiral(pitch: float, reach: float) -> list[tuple[float, float]]:
     steps = range(-count, count + 1)
     points = [(pitch * i, pitch * j) for i in steps for j in steps if pitch * np.hypot(i, j) <= reach + 1e-9]
     return sorted(points, key=lambda point: (round(float(np.hypot(*point)), 9), point))
-
-
-def _shifted(item: Standing, shift: Floats) -> Standing:
-    T = item.T_table_stance.copy()
-    T[:2, 3] += shift
-    return Standing(item.name, item.stance, T)
 
 
 def _any_side(T: Floats, item: Standing) -> list[tuple[Floats, float]]:
