@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 SEARCHES = 16
 """Times that a plan is searched for, each knowing more of what is in the way."""
+_LOOKS = 100
+"""Times that places are looked for before no other search begins."""
 _ASIDE = 100
 """Places that are considered for what is put aside to see behind it."""
 
@@ -362,7 +364,7 @@ class Planner(Stage):
                     steps = shortened(steps, problem, targets, current, avoided=task.avoid)
                 return _solved(steps, text, attempt.problem, expanded=solution.expanded)
             blocked, following = poses, attempt.after(poses, found)
-            if following is None:
+            if following is None or targets.looked > _LOOKS:
                 break
             ctx.log(f"{_no_room(blocked)}; looks for another way")
             attempt = following

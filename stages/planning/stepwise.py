@@ -23,6 +23,8 @@ from stages.planning.targets import Blocked, Crowded, Next, Targets, neighbours
 
 _WAYS = 6
 """Tried in all: orders, the first as the objects are listed; in two ways each where some belong beside others."""
+_LOOKS = 600
+"""Times that places are looked for to make a plan shorter."""
 _ASIDE = 2
 """Times that one object is put aside."""
 
@@ -57,13 +59,13 @@ def shortened(
     avoided: Sequence[str] = (),
 ) -> list[tuple[Step, Floats]]:
     """Steps with their T_base_targets, without those that the others can do without, at first all of one object's;
-    ``avoided`` as above."""
-
-    never = hopeless(avoided)
+    ``avoided`` as above. After as many looks for places as are worth it the plan is short enough.
+    """
+    never, enough = hopeless(avoided), targets.looked + _LOOKS
 
     def placed(fewer: Sequence[Step]) -> list[tuple[Step, Floats]] | None:
         again = [step for step in fewer if step.key in avoided]
-        if not leads_home(fewer, problem) or any(step.key in never for step in fewer):
+        if targets.looked > enough or not leads_home(fewer, problem) or any(step.key in never for step in fewer):
             return None
         poses = targets.of(fewer, scene, again=again, late=problem.items, what="a shorter plan")
         return list(zip(fewer, poses, strict=True)) if isinstance(poses, list) else None

@@ -180,7 +180,7 @@ class Targets:
         self._robot, self._area = robot, workspace.of(robot)
         self._known: dict[Hashable, Options | Blocked] = {}
         self._tries = TRIES
-        self._log, self._looked = log, count(1)
+        self._log, self._told = log, count(1)
         self._what, self._steps = "", 0
         """Which plan it is, and its length."""
 
@@ -221,6 +221,11 @@ class Targets:
         targets = self._targets(_alike_from(number, options.places[: number + self._workspace.targets]), scene)
         return Next(targets, scene.after(step.item, chosen, step.destination))
 
+    @property
+    def looked(self) -> int:
+        """How often places were looked for, each time for another step or in another scene."""
+        return len(self._known)
+
     def _on_its_table(self, scene: Scene) -> Scene:
         """A scene whose table was not seen has the one that the robot is said to stand at."""
         if scene.surface is not None:
@@ -231,7 +236,7 @@ class Targets:
 
     def _tell(self, how_far: str, step: Step) -> None:
         """Now and then, by what was looked at and not by the clock: a plan that is made again says the same."""
-        if next(self._looked) % TOLD == 0:
+        if next(self._told) % TOLD == 0:
             self._log(f"{how_far}; looks for a place for {step.item}")
 
     def _targets(self, places: Sequence[Standing], scene: Scene) -> Floats:

@@ -1036,6 +1036,18 @@ def test_what_the_search_does_not_find_is_planned_one_transfer_after_the_other()
     assert len(found.transfers) <= 10
 
 
+def test_what_took_many_looks_for_places_ends_with_the_plan_that_is_there(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stages.planner._LOOKS", 0)
+    monkeypatch.setattr("stages.planning.stepwise._LOOKS", 0)
+    context = Recorded()
+    task = Task(goal_name="goal", goal=OTHER_WAY_ROUND.graph(), current=FULL_TRAY.graph())
+    found = planner().on_task(task, context)
+    assert found.status == "solved", found.reason
+    assert reached(OTHER_WAY_ROUND, executed(FULL_TRAY, found))
+    assert penetrations(executed(FULL_TRAY, found)) == []
+    assert not any("looks for another way" in line for line in context.lines)
+
+
 def test_one_transfer_after_the_other_also_leads_to_goals_that_do_not_say_where_a_carrier_is():
     text = "(define (problem p) (:domain scene) (:objects bowl cup - item) (:init) (:goal (in cup bowl)))"
     known = {name: stances(name) for name in ("bowl", "cup")}
