@@ -661,19 +661,32 @@ class Demonstrator(Stage):
         state = self._state
         if state.lacking:
             return self._fail("perception", f"{state.lacking}; every other relation of the goal holds", ctx)
-        if hidden := state.unproved.intersection(state.remembered):
-            why = f"let go of, neither felt to stand nor seen since: {', '.join(sorted(hidden))}"
-            return self._look_again("perception", why, ctx)
-        if covered := self._covered(goal):
-            why = f"something unknown stands on {', '.join(covered)}, which the goal wants clear"
-            return self._look_again("perception", why, ctx)
-        if not state.ask and self._misses_unknown(goal):
-            why = "what stood there and no object explained when the goal was taught is not seen there now"
+        if why := self._unproved(goal):
             return self._look_again("perception", why, ctx)
         if unsure := _doubtful_parents(goal):
             why = f"{unsure[0]} was in doubt when the goal was taught, and with it what belongs beside it"
             return self._conclude("perception", f"every relation of the goal holds{from_memory}, yet {why}", ctx)
         return self._conclude("", f"every relation of the goal holds{from_memory}", ctx)
+
+    def _unproved(self, goal: SceneGraph) -> str:
+        """What another look must show before the goal counts as restored, in words; empty where that is nothing."""
+        state = self._state
+        if hidden := state.unproved.intersection(state.remembered):
+            return f"let go of, neither felt to stand nor seen since: {', '.join(sorted(hidden))}"
+        if doubtful := self._unsettled(goal):
+            return f"in doubt: {', '.join(doubtful)}"
+        if covered := self._covered(goal):
+            return f"something unknown stands on {', '.join(covered)}, which the goal wants clear"
+        if not state.ask and self._misses_unknown(goal):
+            return "what stood there and no object explained when the goal was taught is not seen there now"
+        return ""
+
+    def _unsettled(self, goal: SceneGraph) -> list[str]:
+        """Objects of the goal that are less likely as they are taken to be than not, and of which nobody was asked."""
+        scene, names = self._state.scene, _names(goal)
+        assert scene is not None
+        unsure = [item.name for item in scene.objects if item.name in names and is_below(item, UNSURE)]
+        return [name for name in unsure if not any(key.startswith(f"stance {name} ") for key in self._state.answers)]
 
     def _covered(self, goal: SceneGraph) -> list[str]:
         """What is seen, clear in the goal and has something on it that no object explains, unless it had when the goal

@@ -91,14 +91,6 @@ def gap(a: Region, b: Region) -> float:
     return float(min(_corner_distances(a, b).min(), _corner_distances(b, a).min()))
 
 
-def separation(a: Region, b: Region) -> float:
-    """The widest gap between two regions along any edge's normal, metres; negative where they overlap.
-
-    Never more than :func:`gap` and much cheaper: enough to check a clearance.
-    """
-    return max(beyond(sides(a), b), beyond(sides(b), a))
-
-
 def edges(region: Region) -> NDArray[np.float64]:
     """From each corner to the next."""
     return _next(region) - region

@@ -447,7 +447,7 @@ class Targets:
             if not self._on_table(spot, scene):
                 continue
             room = min((_clearance(spot, other) for other in others), default=np.inf)
-            free = min((_separation(spot, other) for other in reserved), default=np.inf)
+            free = min((spot.separation(other) for other in reserved), default=np.inf)
             if room < self._workspace.clearance:
                 continue
             distance = float(np.linalg.norm(spot.T_table_stance[:2, 3] - item.T_table_stance[:2, 3]))
@@ -566,12 +566,7 @@ def _clearance(a: Standing, b: Standing) -> float:
     if a.z_bottom > b.z_top - TOUCHING or b.z_bottom > a.z_top - TOUCHING:
         return np.inf
     between = _distance(a, b) - a.stance.radius - b.stance.radius
-    return between if between > FAR else _separation(a, b)
-
-
-def _separation(a: Standing, b: Standing) -> float:
-    """As :func:`stages.geometry.regions.separation`, asked often of the same objects."""
-    return max(regions.beyond(a.sides, b.outline), regions.beyond(b.sides, a.outline))
+    return between if between > FAR else a.separation(b)
 
 
 def _is_near(a: Standing, b: Standing, metres: float) -> bool:

@@ -127,7 +127,7 @@ def penetration(a: Standing, b: Standing, tolerances: Tolerances) -> float:
     if carried or not (a.stance.aligned and b.stance.aligned):
         return 0.0
     upwards = min(a.z_top, b.z_top) - max(a.z_bottom, b.z_bottom)
-    return max(0.0, min(upwards, -regions.separation(a.outline, b.outline)))
+    return max(0.0, min(upwards, -a.separation(b)))
 
 
 def contact_area(upper: Standing, lower: Standing, tolerances: Tolerances) -> float:

@@ -275,9 +275,15 @@ class Standing:
         """The whole object from above, in the table frame."""
         return regions.moved(self.stance.outline, self.T_table_stance)
 
+    def separation(self, other: Standing) -> float:
+        """The widest gap between two outlines along any edge's normal, metres; negative where they overlap.
+
+        Never more than :func:`stages.geometry.regions.gap` and much cheaper: enough to check a clearance.
+        """
+        return max(regions.beyond(self._sides, other.outline), regions.beyond(other._sides, self.outline))
+
     @cached_property
-    def sides(self) -> tuple[Floats, Floats]:
-        """Of its outline: see :func:`stages.geometry.regions.sides`."""
+    def _sides(self) -> tuple[Floats, Floats]:
         return regions.sides(self.outline)
 
     @cached_property

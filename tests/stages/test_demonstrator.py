@@ -1023,6 +1023,20 @@ def test_no_success_is_claimed_where_a_place_turns_with_what_was_in_doubt(probab
     assert ("tray was in doubt when the goal was taught" in verdict.reason) == (not verdict.success)
 
 
+def test_no_success_is_claimed_where_an_object_is_less_likely_there_than_not() -> None:
+    episode = Episode(repeats=1)
+    episode.until_start(GOAL)
+    assert episode.seen(judged(GOAL, 0.3)) == [LookRequest(purpose="start, look 2")]
+    verdict = the_verdict(episode.seen(judged(GOAL, 0.3)))
+    names = ", ".join(one.name for one in GOAL.objects)
+    assert verdict.failed_stage == "perception" and not verdict.violated
+    assert verdict.reason.startswith(f"in doubt: {names} (2 looks at scene 'start')")
+    episode = Episode(repeats=1)
+    episode.until_start(GOAL)
+    episode.seen(judged(GOAL, 0.3))
+    assert the_verdict(episode.seen(judged(GOAL, 0.6))).success
+
+
 def test_what_is_in_doubt_is_looked_at_a_second_time_before_it_is_moved() -> None:
     episode = Episode()
     episode.until_task(start=judged(START, 0.3))

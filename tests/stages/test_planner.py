@@ -68,7 +68,7 @@ def penetrations(layout: Layout) -> list[tuple[str, str]]:
             held = any(
                 outer.stance.holds and regions.inside(inner.bottom, outer.outline) for inner, outer in ((a, b), (b, a))
             )
-            if level and not held and regions.separation(a.outline, b.outline) < 0.003:
+            if level and not held and a.separation(b) < 0.003:
                 found.append((a.name, b.name))
     return found
 

@@ -10,7 +10,6 @@ from stages.devices.suites.placing import upright
 from stages.devices.suites.suite import Drawn, Kind, graspable, put_somewhere
 from stages.devices.suites.wild import FIXED
 from stages.devices.tabletop import is_seen
-from stages.geometry import regions
 from stages.scene.scoring import label_of
 from stages.scene.stance import Standing
 
@@ -100,7 +99,7 @@ class Disturbed(Drawn):
             hand = np.linalg.norm(simulation.hand()[:2] - (x, y))
             if reach > _REACH or hand < _HAND or not is_seen(self.robot, [*loose, (entry, T)]):
                 continue
-            if all(regions.separation(item.outline, other.outline) > _ROOM for other in others):
+            if all(item.separation(other) > _ROOM for other in others):
                 simulation.add(name, T)
                 return True
         return False

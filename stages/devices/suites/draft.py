@@ -214,9 +214,7 @@ class Draft:
     def _is_apart(self, item: Standing, support: str, apart: float) -> bool:
         others = (other for name, other in self.placed.items() if name not in self._below(support))
         return all(
-            other.z_bottom >= item.z_top
-            or item.z_bottom >= other.z_top
-            or regions.separation(item.outline, other.outline) >= apart
+            other.z_bottom >= item.z_top or item.z_bottom >= other.z_top or item.separation(other) >= apart
             for other in others
         )
 

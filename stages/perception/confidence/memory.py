@@ -96,14 +96,17 @@ class Memory:
         observation: Observation,
     ) -> SceneObject:
         """Who surely saw something before knows better how it stands than a doubtful look at what little shows of it,
-        as of a mug's handle: near where it was, or where it would reach into something else that is ``kept``."""
+        as of a mug's handle: near where it was, or where it would reach into something else that is ``kept``. Nothing
+        turns upside down where it stands, so one that seems to, and reaches into where it was, stands as it did."""
         if before is None or before.probability is None or item.probability is None:
             return item
         if not item.probability < SURE <= before.probability:
             return item
         apart = np.linalg.norm(item.T_base_object[:3, 3] - before.T_base_object[:3, 3])
-        tipped = turned(self._catalogue[item.label], item.T_base_object, before.T_base_object) > TIPPED
-        if (apart > _SAME or tipped) and not any(self._overlap(item, other, scene, _THROUGH) for other in kept):
+        turn = turned(self._catalogue[item.label], item.T_base_object, before.T_base_object)
+        stays = turn <= TIPPED and apart <= _SAME
+        stays |= turn >= np.pi - TIPPED and self._overlap(item, before, scene, _THROUGH)
+        if not stays and not any(self._overlap(item, other, scene, _THROUGH) for other in kept):
             return item
         others = [other for other in scene.objects if other.name != item.name]
         return item if self._seen_empty(before, others, observation) else before
@@ -174,7 +177,7 @@ class Memory:
         if outer.stance.cavity and (fits or min(areas) < _CONTENT * max(areas)):
             return False
         upwards = min(a.z_top, b.z_top) - max(a.z_bottom, b.z_bottom)
-        return upwards > _THROUGH and regions.separation(a.outline, b.outline) < -depth
+        return upwards > _THROUGH and a.separation(b) < -depth
 
     def related(self, scene: SceneGraph, objects: Sequence[SceneObject]) -> SceneGraph:
         """The same scene with other objects: what carries what is found anew, regions stay among neighbours, each where

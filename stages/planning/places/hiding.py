@@ -58,9 +58,7 @@ def _top(name: str, scene: Scene) -> str:
 def _hides(name: str, imagined: Standing, scene: Scene) -> bool:
     assert scene.eye is not None
     hider = scene.standing[name]
-    return (
-        regions.separation(imagined.outline, hider.outline) > 0 and hidden_share(imagined, [hider], scene.eye) > _HIDDEN
-    )
+    return imagined.separation(hider) > 0 and hidden_share(imagined, [hider], scene.eye) > _HIDDEN
 
 
 def _imagined(missing: Sequence[Stances], scene: Scene) -> Iterator[Standing]:
@@ -83,5 +81,5 @@ def _imagined(missing: Sequence[Stances], scene: Scene) -> Iterator[Standing]:
                 item = Standing.at("", stances, T)
                 for support, others in standing_on.items():
                     within = support == TABLE or regions.inside(item.bottom, scene.standing[support].floor)
-                    if within and all(regions.separation(item.outline, other.outline) > 0 for other in others):
+                    if within and all(item.separation(other) > 0 for other in others):
                         yield scene.rested(item, support)

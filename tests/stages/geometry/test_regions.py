@@ -31,17 +31,18 @@ def test_overlap_agrees_with_counted_points(a: tuple[float, ...], b: tuple[float
 
 @given(boxes, boxes)
 @settings(max_examples=60)
-def test_gap_is_symmetric_and_never_below_the_separation(a: tuple[float, ...], b: tuple[float, ...]):
+def test_gap_is_symmetric_and_never_below_what_separates_along_a_normal(a: tuple[float, ...], b: tuple[float, ...]):
     first, second = region(a), region(b)  # type: ignore[arg-type]
     assert regions.gap(first, second) == pytest.approx(regions.gap(second, first), abs=1e-12)
-    assert regions.gap(first, second) >= regions.separation(first, second) - 1e-12
-    assert (regions.gap(first, second) > 1e-9) == (regions.separation(first, second) > 1e-9)
+    separation = max(regions.beyond(regions.sides(first), second), regions.beyond(regions.sides(second), first))
+    assert regions.gap(first, second) >= separation - 1e-12
+    assert (regions.gap(first, second) > 1e-9) == (separation > 1e-9)
 
 
 def test_gap_of_diagonal_neighbours_is_between_corners():
     a, b = regions.rectangle((0, 0), (1, 1)), regions.rectangle((2, 2), (3, 3))
     assert regions.gap(a, b) == pytest.approx(np.sqrt(2))
-    assert regions.separation(a, b) == pytest.approx(1)
+    assert regions.beyond(regions.sides(a), b) == pytest.approx(1)
 
 
 def test_nested_regions_overlap_by_the_inner_one():

@@ -284,6 +284,20 @@ def test_a_doubtful_pose_gives_way_to_a_sure_one_of_before(probability: float | 
     np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ (true if kept else doubted), atol=1e-9)
 
 
+@pytest.mark.parametrize(("off", "kept"), [(0.03, True), (0.1, False)])
+@pytest.mark.parametrize("probability", [0.6, 0.95])
+def test_a_doubtful_look_turns_nothing_upside_down_where_it_stood(probability: float, off: float, kept: bool) -> None:
+    """A mug at the edge of the picture, of which only the rim shows."""
+    true, over = upright("mug", 0.1, 0.1, 0.0), upright("mug", 0.1 + off, 0.1, 0.0)
+    over[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    doubtful = msgspec.structs.replace(known({"mug": over})["mug"], probability=probability)
+    sure = msgspec.structs.replace(known({"mug": true})["mug"], probability=0.99)
+    seen = msgspec.structs.replace(graph({"mug": over}), objects=(doubtful,))
+    (mug,) = MEMORY.complete(seen, {"mug": sure}, observation({"mug": true})).objects
+    believed = true if kept and probability < 0.9 else over
+    np.testing.assert_allclose(mug.T_base_object, T_BASE_TABLE @ believed, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["sugar_box", "tea_box"])
 def test_a_region_is_told_by_the_pose_that_is_believed(name: str) -> None:
     true = {"sugar_box": upright("sugar_box", 0.1, 0.0, 0.3), "tea_box": upright("tea_box", 0.0, 0.1, 0.0)}
