@@ -67,8 +67,8 @@ class Handled:
         """Whether the hand takes the object, wherever it then gets with it."""
         return self._planner.is_picked
 
-    def why_not(self) -> tuple[str, tuple[str, ...]]:
-        """Why no place is reached: in words, and the objects in the way."""
+    def why_not(self) -> tuple[str, list[tuple[str, ...]]]:
+        """Why no place is reached: in words, and the fewest objects in the way; others in other ways, if as few."""
         return self._planner.obstacle[1], self._planner.in_the_way(self._robot.home)
 
 

@@ -146,7 +146,8 @@ class _Way:
                 continue
             tried.add(name)
             step, after = self._moves.aside(name, self._state)
-            found = self._next(step, [*pending, name], late=True)
+            awaits = self._home_of(other) if other != name else None
+            found = self._next(step, [*pending, name], late=True, awaits=awaits)
             if isinstance(found, Next):
                 self._go(step, after, found)
                 self._asides[name] += 1
@@ -162,9 +163,12 @@ class _Way:
         self._state, self._scene = after, found.scene
         self._waits = {item: other for item, other in self._waits.items() if other != step.item}
 
-    def _next(self, step: Step, pending: Sequence[str], *, late: bool) -> Next | Blocked | Crowded:
+    def _next(
+        self, step: Step, pending: Sequence[str], *, late: bool, awaits: Step | None = None
+    ) -> Next | Blocked | Crowded:
         rest = [self._home_of(item) for item in pending]
-        return self._targets.next(step, rest, self._scene, again=step.key in self._avoided, late=late)
+        again = step.key in self._avoided
+        return self._targets.next(step, rest, self._scene, again=again, late=late, awaits=awaits)
 
     def _home_of(self, item: str) -> Step:
         """The step that takes an item to where it belongs."""
@@ -173,10 +177,11 @@ class _Way:
         return Step(item, self._scene.supports[item], self._problem.goal.get(item, TABLE), *beside)
 
     def _in_the_way(self, blocked: Blocked) -> Sequence[str]:
-        """What a step is blocked by and can be moved. Where there is none, a region without room goes with what it is
-        beside; where nothing is known, it may be what stands beside the object."""
+        """What a step is blocked by and can be moved, at last in other ways to do it. Where there is none, a region
+        without room goes with what it is beside; where nothing is known, it may be what stands beside the object."""
         step = blocked.step
-        movable = [name for name in blocked.obstacles if name in self._problem.graspable]
+        ways = (*blocked.obstacles, *blocked.otherwise)
+        movable = [name for name in ways if name in self._problem.graspable]
         parent = [step.parent] if step.region and not blocked.why else []
         return movable or parent or neighbours(step.item, self._scene)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import count, islice, takewhile
+from itertools import chain, count, islice, takewhile
 from math import hypot
 from typing import TYPE_CHECKING
 
@@ -115,6 +115,8 @@ class Blocked:
     """What the hand fails at where there is room for the object."""
     crowding: frozenset[str] = frozenset()
     """Objects that take up other places of the step, or of steps before it whose other places did not help it."""
+    otherwise: tuple[str, ...] = ()
+    """Objects in the hand's way, as few, where those in ``obstacles`` are not."""
 
     @property
     def involved(self) -> frozenset[str]:
@@ -204,15 +206,23 @@ class Targets:
         return found if isinstance(found, Blocked | Crowded) else [self._targets(places, scene) for places in found]
 
     def next(
-        self, step: Step, rest: Sequence[Step], scene: Scene, *, again: bool, late: bool
+        self,
+        step: Step,
+        rest: Sequence[Step],
+        scene: Scene,
+        *,
+        again: bool,
+        late: bool,
+        awaits: Step | None = None,
     ) -> Next | Blocked | Crowded:
-        """One step's targets and the scene after it, whatever becomes of the ``rest``."""
+        """One step's targets and the scene after it, whatever becomes of the ``rest``; ``awaits`` is the step to which
+        its object makes way."""
         self._tell(f"one transfer after the other: {len({one.item for one in (step, *rest)})} objects to move", step)
         scene = self._on_its_table(scene)
         options = self._options(step, rest, scene, again)
         if isinstance(options, Blocked):
             return options
-        number = next(self._tried(step, options, rest, scene), None)
+        number = next(self._tried(step, options, rest, scene, awaits=awaits), None)
         if number is None:
             return _trouble(step, options, None)
         chosen = options.places[number]
@@ -310,23 +320,39 @@ class Targets:
         return self._known[key]
 
     def _tried(
-        self, step: Step, options: Options, rest: Sequence[Step], scene: Scene, *, clear: bool = False
+        self,
+        step: Step,
+        options: Options,
+        rest: Sequence[Step],
+        scene: Scene,
+        *,
+        clear: bool = False,
+        awaits: Step | None = None,
     ) -> Iterator[int]:
         """Numbers of places that the hand reaches, first those where what goes beside the object follows, from which an
-        object that must be turned can be taken to where it belongs and, if it is to be ``clear``, that leave the hand
-        room for what is still to be picked."""
+        object that must be turned can be taken to where it belongs, where the hand then takes what ``awaits`` this step
+        and, if it is to be ``clear``, that leave the hand room for what is still to be picked."""
         children = [other for other in rest if other.parent == step.item]
         children += [other for other in rest if other.item == step.item and step.item in self._turned]
         hindered: list[int] = []
-        for number in islice(options.handled.places(), FOLLOWED if children else None):
+        for number in islice(options.handled.places(), FOLLOWED if children or awaits else None):
             place = options.places[number]
             after = scene.after(step.item, place, step.destination)
             crowds = clear and self._crowds(place, rest, scene)
-            if not crowds and all(self._follows(child, step.item, after) for child in children):
+            follows = not crowds and all(self._follows(child, step.item, after) for child in children)
+            if follows and (awaits is None or self._takes(awaits, after)):
                 yield number
             else:
                 hindered.append(number)
         yield from hindered
+
+    def _takes(self, step: Step, scene: Scene) -> bool:
+        """Whether the hand takes a step's object as things stand."""
+        options = self._options(step, (), scene, again=False)
+        if isinstance(options, Blocked):
+            return False
+        next(options.handled.places(), None)
+        return options.handled.is_picked
 
     def _follows(self, child: Step, parent: str, scene: Scene) -> bool:
         """Whether a step can be done once its parent is where it is, at least after others have moved; the next step of
@@ -335,7 +361,7 @@ class Targets:
         if isinstance(options, Options):
             if next(options.handled.places(), None) is not None:
                 return True
-            obstacles = options.handled.why_not()[1]
+            obstacles = next(iter(options.handled.why_not()[1]), ())
         else:
             obstacles = options.obstacles
         own = child.item == parent or parent in obstacles
@@ -524,10 +550,12 @@ def _trouble(step: Step, options: Options, failed: Blocked | None) -> Blocked:
     """
     blocked = options.blocked
     if failed is None:
-        why, obstacles = options.handled.why_not()
+        why, ways = options.handled.why_not()
+        obstacles, *others = ways or [()]
+        otherwise = tuple(dict.fromkeys(chain.from_iterable(others)))
         if not options.handled.is_picked:
-            return Blocked(step, obstacles, why)
-        return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why)
+            return Blocked(step, obstacles, why, otherwise=otherwise)
+        return replace(blocked, obstacles=obstacles or blocked.obstacles, why=why, otherwise=otherwise)
     if not failed.obstacles and blocked.obstacles:
         return blocked
     return replace(failed, crowding=failed.crowding | blocked.crowding)

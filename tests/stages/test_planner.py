@@ -882,6 +882,20 @@ def test_what_makes_room_is_not_put_where_the_room_is_needed():
     assert reached(goal, executed(start, found))
 
 
+def test_of_two_that_keep_the_hand_from_each_other_one_is_freed_by_what_else_is_in_its_way():
+    """As a scene had it: a bottle between a carton and a box; the carton can only be taken without the bottle."""
+    goal = Layout().put("tray", 0.154, 0.007, yaw=-0.87).put("sugar_box", 0.065, 0.335, yaw=-0.2)
+    goal = goal.put("milk_carton", 0.046, -0.177, yaw=1.79).put("sauce_bottle", -0.1, -0.02, yaw=-2.2, on="tray")
+    start = Layout().put("tray", 0.154, 0.007, yaw=-0.87).put("sugar_box", -0.063, -0.027, yaw=-2.09)
+    start = start.put("milk_carton", -0.043, -0.232, yaw=-1.31).put("sauce_bottle", -0.038, -0.156, yaw=-2.55)
+    start = start.put("salt_shaker", 0.027, -0.276, yaw=-3.12).put("cereal_box", -0.06, -0.39, yaw=1.13)
+    found = plan(goal, start)
+    assert found.status == "solved", found.reason
+    assert reached(goal, executed(start, found)) and not penetrations(executed(start, found))
+    moved = [transfer.object for transfer in found.transfers]
+    assert moved.index("sugar_box") < moved.index("sauce_bottle")
+
+
 def test_what_hides_something_is_put_where_it_hides_nothing_of_that():
     current = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2)
     goal = Layout().put("milk_carton", 0.0, 0.0).put("sugar_box", 0.0, 0.2).put("salt_shaker", 0.1, 0.0)

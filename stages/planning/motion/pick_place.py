@@ -147,15 +147,18 @@ class PickPlacePlanner:
                 return True
         return False
 
-    def in_the_way(self, start: Floats) -> tuple[str, ...]:
-        """The fewest objects that keep the hand from the pick, or from the place if there is a pick.
+    def in_the_way(self, start: Floats) -> list[tuple[str, ...]]:
+        """The fewest objects that keep the hand from the pick, or from the place if there is a pick; others in other
+        ways, if they are as few.
 
         Empty where it is not objects that keep it from there. To be asked once :meth:`reaches` has said no.
         """
         poses = self._errand.targets if self.is_picked else [self._errand.T_base_object]
         hands = (hand for T in poses for grasp in self._grasps for hand in self._hands(grasp, T))
         found = (self._touched(hand, start) for hand in islice(hands, _SUSPECTED))
-        return min((names for names in found if names), key=self._effort, default=())
+        ways = list(dict.fromkeys(names for names in found if names))
+        least = min(map(self._effort, ways), default=None)
+        return [names for names in ways if self._effort(names) == least]
 
     @property
     def is_picked(self) -> bool:

@@ -63,7 +63,7 @@ def test_what_only_leans_on_an_object_is_not_in_the_way_of_what_lifts_it() -> No
     }
     *_, (_, planner) = ways("tea_box", poses, standing("tea_box", 0.65, -0.2))
     assert not planner.reaches(0, ROBOT.home)
-    assert planner.in_the_way(ROBOT.home) == ("tray",)
+    assert planner.in_the_way(ROBOT.home) == [("tray",)]
 
 
 def test_it_is_carried_with_room_below_for_what_slides_down_in_the_hand() -> None:
