@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from stages.geometry import regions
 from stages.messages.scene import UnknownRegion
 from stages.scene.relations import Tolerances, gaps, is_covered, penetration
 from stages.scene.stance import Standing
@@ -247,3 +248,14 @@ def test_what_no_object_explains_stands_on_what_it_is_clearly_above(
     centre, extent = np.array([0.2 + x, 0.1, (bottom + top) / 2]), np.array([0.04, 0.04, top - bottom])
     thing = UnknownRegion(box=np.zeros(4), points=200, centre_table=centre, extent_table=extent)
     assert is_covered(item, (thing,), Tolerances()) == covered
+
+
+@given(st.sampled_from(["tea_box", "mug", "tuna_can"]), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3, 3))
+@settings(max_examples=60)
+def test_objects_are_separated_as_far_as_there_is_a_gap_and_never_by_more(name: str, x: float, y: float, yaw: float):
+    poses = Layout().put("sugar_box", 0.0, 0.0).put(name, x, y, yaw=yaw).poses
+    a, b = (Standing.at(one, stances(one), T) for one, T in poses.items())
+    gap = regions.gap(a.outline, b.outline)
+    assert a.separation(b) == b.separation(a)
+    assert gap >= a.separation(b) - 1e-12
+    assert (gap > 1e-9) == (a.separation(b) > 1e-9)
