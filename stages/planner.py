@@ -156,7 +156,7 @@ class Planner(Stage):
 
     def _plan(self, task: Task, taught: SceneGraph, ctx: Context) -> Plan:
         """A plan for the task's goal, which may tell the regions that were ``taught`` the other way round."""
-        held, violated = satisfied(task.goal, task.current, self._catalogue)
+        held, violated = satisfied(task.goal, task.current, self._catalogue, taught=taught)
         problem = self._problem(task, held)
         text = problem_pddl(task.goal_name, problem, task.current, task.goal)
         if not violated:

@@ -209,15 +209,21 @@ def without(goal: SceneGraph, names: set[str]) -> SceneGraph:
 
 
 def satisfied(
-    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue, share: float = CLAIMED
+    goal: SceneGraph,
+    current: SceneGraph,
+    catalogue: Catalogue,
+    share: float = CLAIMED,
+    *,
+    taught: SceneGraph | None = None,
 ) -> tuple[tuple[Assertion, ...], tuple[Assertion, ...]]:
     """The goal's assertions that hold in the current scene, and those that do not.
 
     Compares the topological layout (paper, section VI-B): exist, on, in and clear as the current scene asserts them;
     has and in of a virtual object by the current poses, in ``share`` of its radius, whatever virtual objects the
-    current scene has, and faces by the current poses. What lies and stood, or the other way round, is not on or in what
-    carries it as the goal has it. Poses and objects that the goal does not name are not compared, except that these
-    may not be on or in a goal object that was clear.
+    current scene has, and faces by the current poses. Where ``goal`` tells a region the other way round than it was
+    ``taught``, the taught one counts: half a turn of a box turns what is told from it, too. What lies and stood, or the
+    other way round, is not on or in what carries it as the goal has it. Poses and objects that the goal does not name
+    are not compared, except that these may not be on or in a goal object that was clear.
     """
     over = fallen(goal, current, catalogue)
     # Regions of the current scene may have the same names and mean other places.
@@ -225,7 +231,7 @@ def satisfied(
     real = (item for item in current.assertions if regions_now.isdisjoint(item.arguments))
     standing = (item for item in real if item.predicate not in ("on", "in") or item.arguments[0] not in over)
     asserted = {(item.predicate, item.arguments) for item in standing}
-    asserted |= _held_regions(goal, current, catalogue, share) | facing.held(goal, current)
+    asserted |= _held_regions(goal, current, catalogue, share, taught) | facing.held(goal, current)
     held = [item for item in goal.assertions if (item.predicate, item.arguments) in asserted]
     violated = [item for item in goal.assertions if (item.predicate, item.arguments) not in asserted]
     return tuple(held), tuple(violated)
@@ -242,16 +248,20 @@ def fallen(goal: SceneGraph, current: SceneGraph, catalogue: Catalogue) -> froze
 
 
 def _held_regions(
-    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue, share: float
+    goal: SceneGraph, current: SceneGraph, catalogue: Catalogue, share: float, taught: SceneGraph | None
 ) -> set[tuple[str, tuple[str, ...]]]:
     poses = {item.name: item for item in current.objects}
+    judged = {frozenset((item.parent, item.child)): item for item in taught.virtual_objects} if taught else {}
     held: set[tuple[str, tuple[str, ...]]] = set()
     for virtual in goal.virtual_objects:
-        parent, child = poses.get(virtual.parent), poses.get(virtual.child)
-        if parent is None:
+        if virtual.parent not in poses:
             continue
         held.add(("has", (virtual.parent, virtual.name)))
+        judge = judged.get(frozenset((virtual.parent, virtual.child)), virtual)
+        parent, child = poses.get(judge.parent), poses.get(judge.child)
+        if parent is None or child is None:
+            continue
         symmetries = catalogue[parent.label].symmetries
-        if child is not None and in_region(virtual, parent.T_base_object, child.T_base_object, symmetries, share):
+        if in_region(judge, parent.T_base_object, child.T_base_object, symmetries, share):
             held.add(("in", (virtual.name, virtual.child)))
     return held

@@ -646,6 +646,17 @@ def test_objects_that_stand_beside_each_other_in_a_circle_are_refused():
     assert found.reason.endswith("are beside each other in a circle"), found.reason
 
 
+def test_what_stands_beside_an_object_only_as_told_the_other_way_round_is_moved():
+    goal = Layout().put("cereal_box", -0.054, 0.204, yaw=-2.95).put("sugar_box", 0.012, 0.288, yaw=1.09)
+    goal.put("water_bottle", 0.032, 0.371).put("sauce_bottle", 0, 0, on="sugar_box")
+    # The hand does not get to the sugar box. That has been turned: the cereal box stands at its old place beside it.
+    start = Layout().put("cereal_box", 0.053, -0.188, yaw=2.8).put("sugar_box", 0.039, -0.069, yaw=1.46)
+    start.put("water_bottle", -0.03, 0.15).put("sauce_bottle", 0, 0, on="sugar_box")
+    found = plan(goal, start)
+    assert found.status == "solved", found.reason
+    assert [transfer.object for transfer in found.transfers] == ["cereal_box", "water_bottle"]
+
+
 def test_without_room_within_reach_the_task_is_refused():
     cramped = Planner(Planner.Config(catalogue=CATALOGUE, workspace=Workspace(x=(0.59, 0.61), y=(-0.01, 0.01))))
     goal = Layout().put("tea_box", 0, 0).put("tuna_can", 0, 0, on="tea_box")

@@ -65,6 +65,22 @@ def test_a_chain_can_be_told_from_its_other_end():
     assert len(told.assertions) == len(goal.assertions)
 
 
+def test_told_from_its_other_end_a_region_holds_what_the_taught_one_does():
+    goal = Layout().put("cereal_box", 0, 0).put("sugar_box", 0, 0.12).graph()
+    (taught,) = goal.virtual_objects
+    told = rerooted(goal, taught.child)
+    (back,) = told.virtual_objects
+    # Turned by a quarter the sugar box has the cereal box at its old place beside it, and stands at another one itself.
+    turned = Layout().put("cereal_box", -0.12, 0.12).put("sugar_box", 0, 0.12, yaw=np.pi / 2).graph()
+    assert back.name not in {item.arguments[0] for item in satisfied(told, turned, catalogue())[1]}
+    (lacking,) = satisfied(told, turned, catalogue(), taught=goal)[1]
+    assert (lacking.predicate, lacking.arguments) == ("in", (back.name, back.child))
+    # At its taught place it holds, though by the other telling it would not.
+    quarter = Layout().put("cereal_box", 0, 0).put("sugar_box", 0, 0.12, yaw=np.pi / 2).graph()
+    assert satisfied(told, quarter, catalogue())[1] == (lacking,)
+    assert satisfied(told, quarter, catalogue(), taught=goal)[1] == ()
+
+
 def doubted(layout: Layout, *names: str) -> set[tuple[str, str]]:
     """Parents and children where the poses of some objects are in doubt."""
     estimate = layout.estimate()
