@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -61,15 +59,19 @@ class Attempt:
     regrasped: frozenset[str] = frozenset()
     """What is put aside first: the hand cannot turn it at once, or has failed with it again and again."""
 
-    def steps(self, found: Sequence[Step]) -> tuple[Step, ...]:
-        """What the search found, with a step more for what is regrasped, unless it is put aside anyway."""
-        moved = Counter(step.item for step in found)
-        once = {item for item in self.regrasped if moved[item] == 1}
-        parts = (
-            (Step(step.item, step.source, TABLE), replace(step, source=TABLE)) if step.item in once else (step,)
-            for step in found
-        )
-        return tuple(chain.from_iterable(parts))
+    def steps(self, found: Sequence[Step]) -> list[Step]:
+        """What the search found, with a step more for what is regrasped, unless it is put aside anyway; what moves
+        again is put aside on the table, wherever the search has it meanwhile."""
+        last = {step.item: number for number, step in enumerate(found)}
+        steps, aside = list[Step](), set[str]()
+        for number, step in enumerate(found):
+            final = number == last[step.item]
+            if not final or step.item in self.regrasped - aside:
+                steps.append(Step(step.item, TABLE if step.item in aside else step.source, TABLE))
+                aside.add(step.item)
+            if final:
+                steps.append(replace(step, source=TABLE) if step.item in aside else step)
+        return steps
 
     def after(self, blocked: Blocked, steps: Sequence[Step]) -> Attempt | None:
         """The attempt that makes room for a step, or None where nothing is left to try.

@@ -22,7 +22,7 @@ from stages.planning.handling import Handling
 from stages.planning.places.placements import Placements, Scene
 from stages.planning.places.sight import hidden_share
 from stages.planning.stepwise import stepwise
-from stages.planning.symbolic.problem import TABLE, Problem
+from stages.planning.symbolic.problem import TABLE, Problem, carriers
 from stages.planning.symbolic.search import Step
 from stages.planning.targets import Crowded, Next, Targets, Workspace, neighbours
 from stages.scene.facing import SIDES, faced, turned_to
@@ -51,6 +51,7 @@ def executed(current: Layout, found: Plan, *, which: int = 0) -> Layout:
     for transfer in found.transfers:
         target = transfer.T_base_targets[min(which, len(transfer.T_base_targets) - 1)]
         after.poses[transfer.object] = inverse(T_BASE_TABLE) @ target
+        assert carriers(after.graph())[transfer.object] == transfer.destination, f"{transfer.key}: is elsewhere then"
     return after
 
 
@@ -1115,6 +1116,19 @@ def test_what_is_left_of_a_plan_is_gone_on_with_wherever_the_hand_puts_things(wh
     keys, after = restored(TOWERS, BESIDE_A_TOWER, which=which)
     assert reached(TOWERS, after)
     assert len(keys) <= 5
+
+
+def test_what_changes_places_on_a_tray_waits_on_the_table():
+    goal, start = (
+        Layout().put("tray", 0, 0).put("mug", *mug, on="tray").put("soup_can", *can, on="tray")
+        for mug, can in (((0.0, 0.06), (0.1, 0.06)), ((0.1, -0.06), (0.0, -0.06)))
+    )
+    goal.put("sugar_box", 0.0, -0.06, on="tray").put("tuna_can", 0.1, -0.06, on="tray")
+    start.put("sugar_box", 0.0, 0.06, on="tray").put("tuna_can", -0.1, 0.06, on="tray")
+    found = plan(goal, start)
+    keys = [transfer.key for transfer in found.transfers]
+    assert keys == ["soup_can: tray -> table", "mug: tray -> tray", "soup_can: table -> tray"]
+    assert reached(goal, executed(start, found))
 
 
 def test_a_plan_that_does_not_lead_to_the_goal_any_more_is_made_anew():
