@@ -26,8 +26,9 @@ _DRIFT = 0.01
 """Metres that an object may move while the scene settles before the arrangement counts as failed."""
 _TILT = 0.995
 """Cosine of the largest turn of its axis with which an object still stands as it was laid out."""
-_DRAWS = 1000
-"""Of one scene before it counts as impossible: full trays take hundreds, of a few milliseconds each."""
+_DRAWS = 10000
+"""Of one scene before it counts as impossible: full trays and dense starts take hundreds, few of them thousands, of a
+few milliseconds each."""
 
 
 class World(SimulatedRobot):
