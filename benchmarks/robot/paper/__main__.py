@@ -1,9 +1,9 @@
 """The paper's experiments with the robot, redone: `python -m benchmarks.paper [--out FOLDER]`.
 
-The proof of concept (two goals from four starts each, poses from features) and programming by demonstration with
-DIGEST (five goals from two starts each). Prints the table beside the paper's figures, and how often which stage failed;
-writes a picture of every goal with its starts and ends. ``--episodes FILE...`` adds to the failures those that
-`benchmarks.episodes --json FILE` found.
+The proof of concept (two goals from four starts each; poses from features, of objects that are known, so there are no
+strangers) and programming by demonstration with DIGEST (five goals from two starts each, with three strangers). Prints
+the table beside the paper's figures, and how often which stage failed; writes a picture of every goal with its starts
+and ends. ``--episodes FILE...`` adds to the failures those that `benchmarks.episodes --json FILE` found.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ class Experiment:
     """Poses come from features instead of DIGEST."""
     goals: tuple[str, ...]
     starts: int
+    strangers: int
+    """Objects of no goal in each start."""
     paper: int
     """Restored in the paper, of as many."""
 
@@ -47,10 +49,14 @@ class Experiment:
         """Goals times starts."""
         return len(self.goals) * self.starts
 
+    def settings(self, goal: str) -> tuple[str, ...]:
+        """Of the graph, for an episode of this goal."""
+        return f"world.goal={goal}", f"world.strangers={self.strangers}"
+
 
 EXPERIMENTS = (
-    Experiment("proof of concept, poses from features", True, ("breakfast", "lunch"), 4, 8),
-    Experiment("programming by demonstration, DIGEST", False, tuple(GOALS), 2, 10),
+    Experiment("proof of concept, poses from features", True, ("breakfast", "lunch"), 4, 0, 8),
+    Experiment("programming by demonstration, DIGEST", False, tuple(GOALS), 2, 3, 10),
 )
 
 
@@ -60,14 +66,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("comparisons/paper"))
     parser.add_argument("--first-seed", type=int, default=0, help="of the starts; each has a seed of its own")
+    parser.add_argument("--strangers", type=int, help="objects of no goal in each start, instead of 0 and 3")
     parser.add_argument("--episodes", type=Path, nargs="*", default=[], help="JSON files of benchmarks.episodes")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     done: list[tuple[Experiment, list[Episode]]] = []
-    for number, experiment in enumerate(EXPERIMENTS):
+    for number, each in enumerate(EXPERIMENTS):
+        experiment = each if options.strangers is None else replace(each, strangers=options.strangers)
         graph = with_features(options.out / "proof.yaml") if experiment.features else _GRAPH
         print(f"\n{experiment.title}\n\n{HEADER}")
-        episodes = [_printed(run(options.first_seed + start, graph, (f"world.goal={goal}",)))
+        episodes = [_printed(run(options.first_seed + start, graph, experiment.settings(goal)))
                     for goal in experiment.goals for start in range(experiment.starts)]  # fmt: skip
         sheet(rows(experiment, episodes)).save(options.out / f"experiment-{number + 1}.webp", quality=QUALITY)
         done.append((experiment, episodes))
@@ -102,12 +110,15 @@ def _printed(episode: Episode) -> Episode:
 
 def table(done: Iterable[tuple[Experiment, Sequence[Episode]]]) -> str:
     """Restored in the paper and here, by the simulator's truth."""
-    lines = ["| experiment | goals | starts of each | paper | here, in truth | false successes |", "|---" * 6 + "|"]
+    lines = [
+        "| experiment | goals | starts of each | strangers | paper | here, in truth | false successes |",
+        "|---" * 7 + "|",
+    ]
     for one, episodes in done:
         judgements = [episode.judgement for episode in episodes]
         restored, false = sum(each.restored for each in judgements), sum(each.false_success for each in judgements)
         lines.append(
-            f"| {one.title} | {len(one.goals)} | {one.starts} | {one.paper} of {one.episodes} | "
+            f"| {one.title} | {len(one.goals)} | {one.starts} | {one.strangers} | {one.paper} of {one.episodes} | "
             f"{restored} of {one.episodes} | {false} |"
         )
     return "\n".join(lines)

@@ -19,7 +19,7 @@ def test_goals_are_those_of_the_suite(experiment: Experiment) -> None:
 
 
 def test_the_proof_of_concept_is_the_main_job_without_digest(tmp_path: Path) -> None:
-    graph = load_graph(with_features(tmp_path / "proof.yaml"), ("world.goal=lunch",))
+    graph = load_graph(with_features(tmp_path / "proof.yaml"), EXPERIMENTS[0].settings("lunch"))
     assert {"features", "world", "planner", "executor", "report"} <= set(graph.nodes)
     assert not set(graph.nodes) & {"hypotheses", "particle_filter", "ranker", "refiner"}
     written = yaml.safe_load((tmp_path / "proof.yaml").read_text())["stages"]
@@ -34,6 +34,6 @@ def episode(*, restored: bool, claimed: bool) -> Episode:
 def test_the_table_counts_by_truth_and_failures_by_stage() -> None:
     good, bad = (episode(restored=each, claimed=each) for each in (True, False))
     line = table([(EXPERIMENTS[0], [good] * 7 + [bad])]).splitlines()[-1]
-    assert "| 2 | 4 | 8 of 8 | 7 of 8 | 0 |" in line
+    assert "| 2 | 4 | 0 | 8 of 8 | 7 of 8 | 0 |" in line
     assert failures([good.summary()]) == "All of 1 episodes were restored."
     assert failures([good.summary(), bad.summary()]).splitlines()[-1] == "| runner | 1 of 2 | not seen: cup |"
