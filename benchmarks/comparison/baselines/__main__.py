@@ -27,7 +27,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("dataset", type=Path, help="BOP data set folder")
     parser.add_argument("detections", help="exact, noisy or a file of detections")
     parser.add_argument("out", type=Path, help="BOP results, CSV")
-    parser.add_argument("--dof", type=int, choices=(3, 6), default=6)
+    parser.add_argument("--dof", type=int, choices=(3, 4, 6), default=6)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--images", default=None, help="the first N, or ids such as 1/0,2/0")
     return parser.parse_args()

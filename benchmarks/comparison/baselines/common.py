@@ -18,7 +18,8 @@ from stages.messages import Candidate
 from stages.perception.rendering.rasteriser import Float32s, inverse_depth
 from stages.scene.catalogue import Catalogue, CatalogueObject
 
-Dof = Literal[3, 6]
+Dof = Literal[3, 4, 6]
+"""Upright on the plane, upright at any height, or free."""
 Found = tuple[str, Floats, float]
 """Label, T_camera_object (4 x 4) and score."""
 _CORES = 2

@@ -30,9 +30,9 @@ def voxel_thinned(points: Floats, voxel: float) -> Floats:
 def polished(box: Box, found: Floats) -> Floats:
     """Poses found by features (P x 4 x 4) after the fine ICP of the multi-start baseline, best agreement first.
 
-    With three degrees of freedom each keeps its yaw and is set upright on the plane before.
+    With fewer than six degrees of freedom each keeps its yaw and is set upright before, with three on the plane.
     """
-    return refined(box, _upright(box, found) if box.dof == 3 else found) if len(found) else found
+    return refined(box, _upright(box, found) if box.dof < 6 else found) if len(found) else found
 
 
 def _upright(box: Box, found: Floats) -> Floats:
@@ -45,4 +45,4 @@ def _upright(box: Box, found: Floats) -> Floats:
         centre = T[:3, :3] @ box.model.centre + T[:3, 3]
         T[:3, :3] = T_camera_table[:3, :3] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         T[:3, 3] = centre - T[:3, :3] @ box.model.centre
-    return on_plane(put, box.model, T_camera_table)
+    return on_plane(put, box.model, T_camera_table) if box.dof == 3 else put

@@ -86,9 +86,9 @@ def _resting(box: Box, turns: Floats, shown: Floats, ray: Floats) -> Floats:
 
 
 def rotations(T_camera_table: Floats, dof: int, yaws: int) -> Floats:
-    """Orientations of an object that rests on one of its six faces (upright with 3 degrees of freedom), P x 3 x 3."""
+    """Orientations of an object on one of its six faces (upright with fewer than 6 degrees of freedom), P x 3 x 3."""
     tips = np.deg2rad([[0, 0, 0], [180, 0, 0], [90, 0, 0], [-90, 0, 0], [0, 90, 0], [0, -90, 0]])
-    faces = exp_so3(tips[: 1 if dof == 3 else 6])
+    faces = exp_so3(tips[: 1 if dof < 6 else 6])
     turns = exp_so3(np.outer(np.linspace(0, 2 * np.pi, yaws, endpoint=False), [0.0, 0.0, 1.0]).astype(np.float64))
     return np.concatenate([T_camera_table[:3, :3] @ turns @ face for face in faces])
 

@@ -18,7 +18,7 @@ def poses(box: Box, trained: None = None) -> Floats:
         return np.zeros((0, 4, 4))
     T = np.eye(4)
     yaw = exp_so3(box.rng.uniform(-np.pi, np.pi) * np.array([0.0, 0.0, 1.0]))
-    T[:3, :3] = box.observed.T_camera_table[:3, :3] @ yaw if box.dof == 3 else random_rotations(1, box.rng)[0]
+    T[:3, :3] = box.observed.T_camera_table[:3, :3] @ yaw if box.dof < 6 else random_rotations(1, box.rng)[0]
     T[:3, 3] = readings[box.rng.integers(len(readings))] - T[:3, :3] @ box.model.centre
     return on_plane(T[None], box.model, box.observed.T_camera_table) if box.dof == 3 else T[None]
 

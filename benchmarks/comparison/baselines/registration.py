@@ -84,12 +84,12 @@ def surface(item: CatalogueObject, count: int) -> tuple[Floats, Floats]:
 
 
 def directions(dof: int, T_camera_table: Floats) -> Floats:
-    """Twists (rotation, translation; camera frame) an object may make, 6 x dof: 3 keeps it upright on the plane."""
+    """Twists (rotation, translation; camera) an object may make, 6 x dof: 4 keep it upright, 3 also on the plane."""
     if dof == 6:
         return np.eye(6)
-    basis = np.zeros((6, 3))
+    basis = np.zeros((6, dof))
     basis[:3, 0] = T_camera_table[:3, 2]
-    basis[3:, 1:] = T_camera_table[:3, :2]
+    basis[3:, 1:] = T_camera_table[:3, : dof - 1]
     return basis
 
 

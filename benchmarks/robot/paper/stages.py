@@ -1,4 +1,4 @@
-"""Perception of the paper's proof of concept: poses from features instead of DIGEST, with known labels."""
+"""Perception of the paper's proof of concept: poses from features instead of DIGEST, known labels, upright objects."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class FeatureScene(Stage):
         yield seen
         known = msgspec.structs.replace(candidates, candidates=tuple(best.values()))
         image = Image(msgspec.structs.replace(frame, n_objects=self.config.n_objects), known, ())
-        found = self._estimate(image, self._catalogue, dof=6)
+        found = self._estimate(image, self._catalogue, dof=4)
         yield SceneEstimate(
             objects=tuple(
                 ObjectPose(

@@ -54,6 +54,18 @@ def test_every_method_stays_near_its_box_and_repeats(method: str) -> None:
     assert all(metres < (0.05 if method in ("ppf", "perch") else 0.3) for metres, _ in found.values())
 
 
+def test_with_four_degrees_of_freedom_what_stands_on_another_stays_there_upright() -> None:
+    below, above = "tea_box", "tuna_can"
+    stacked = upright(above, 0.0, 0.0, 0.0)
+    stacked[2, 3] += CATALOGUE[below].dimensions[2]
+    scene = render({below: upright(below, 0.0, 0.0, 0.4), above: stacked})
+    found = METHODS["ppf"](image_of(scene, (below, above)), CATALOGUE, dof=4, seed=0)
+    assert [label for label, _, _ in found] == [below, above]
+    for label, T, _ in found:
+        metres, _ = pose_errors(T, scene.poses[label], CATALOGUE[label].symmetries.transforms())
+        assert metres < 0.01 and T[:3, 2] @ scene.scene.T_camera_table[:3, 2] > np.cos(np.deg2rad(1))
+
+
 def test_the_same_seed_gives_the_same_bytes_with_six_degrees_of_freedom() -> None:
     first, second = (METHODS["icp"](image_of(SCENE), CATALOGUE, dof=6, seed=3) for _ in range(2))
     assert [T.tobytes() for _, T, _ in first] == [T.tobytes() for _, T, _ in second]
