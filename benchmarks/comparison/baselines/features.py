@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmarks.comparison.baselines.common import Box
-from benchmarks.comparison.baselines.icp import on_plane, refined
+from benchmarks.comparison.baselines.icp import coarse, on_plane, refined
 from stages.geometry.arrays import Floats
 
 _NEIGHBOURS = 20
@@ -28,11 +28,17 @@ def voxel_thinned(points: Floats, voxel: float) -> Floats:
 
 
 def polished(box: Box, found: Floats) -> Floats:
-    """Poses found by features (P x 4 x 4) after the fine ICP of the multi-start baseline, best agreement first.
+    """Poses found by features (P x 4 x 4) after the ICP of the multi-start baseline, best agreement first.
 
-    With fewer than six degrees of freedom each keeps its yaw and is set upright before, with three on the plane.
+    Fine ICP is enough for them as found. With fewer than six degrees of freedom each keeps its yaw and is set upright
+    before, with three on the plane; as that moves it, it is refined after coarse ICP too.
     """
-    return refined(box, _upright(box, found) if box.dof < 6 else found) if len(found) else found
+    if not len(found):
+        return found
+    if box.dof < 6:
+        put = _upright(box, found)
+        found = np.concatenate([put, coarse(box, put)])
+    return refined(box, found)
 
 
 def _upright(box: Box, found: Floats) -> Floats:

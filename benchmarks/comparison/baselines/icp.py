@@ -44,12 +44,17 @@ def poses(box: Box, trained: None = None) -> Floats:
 
 def best(box: Box, begin: Floats) -> Floats:
     """Starts (P x 4 x 4) after coarse and fine ICP, best first by rendered-depth agreement."""
+    return refined(box, coarse(box, begin))
+
+
+def coarse(box: Box, begin: Floats) -> Floats:
+    """Starts (P x 4 x 4) after coarse ICP, in the same order."""
     readings = box.observed.inside(box.candidate)
     # What lies a diameter in front of the middle or behind it belongs to no object in the box.
     near = np.abs(readings[:, 2] - np.median(readings[:, 2])) < box.model.diameter
     scene = Grid.of(thinned(readings[near], _SOUGHT), voxel=0.008, margin=0.05)
     basis = directions(box.dof, box.observed.T_camera_table)
-    return refined(box, model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING))
+    return model_to_readings(box.model, scene, begin, _COARSE, basis, count=_SEEKING)
 
 
 def refined(box: Box, begin: Floats) -> Floats:
